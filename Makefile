@@ -1,0 +1,48 @@
+# Everything runs in .venv, made on first use: with uv where it is there, else with venv and pip.
+# A user needs Python 3.11 or newer and make.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.ready
+
+.PHONY: demo test check prove bench format lock clean
+
+demo: $(STAMP)  ## simulate a hall, run the receiver on it, show picture and table
+	$(BIN)/sonofix demo
+
+test: check  ## every check and every test
+	$(BIN)/python -m pytest
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+prove: $(STAMP)  ## long statistics; prints the tables of docs/statistics.md
+	$(BIN)/python -m pytest -m prove -s tests/statistics
+
+bench: $(STAMP)  ## benchmarks against peers and floors in the same run
+	$(BIN)/python benchmarks/street.py
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+lock:  ## renew requirements.lock (needs uv)
+	uv pip compile --quiet --universal --python-version 3.11 --no-header --no-annotate --no-emit-index-url \
+	  --no-emit-find-links --generate-hashes --all-extras --group dev pyproject.toml -o requirements.lock
+
+$(STAMP): pyproject.toml requirements.lock
+	@if command -v uv >/dev/null 2>&1; then \
+	  test -x $(BIN)/python || uv venv --quiet --python $(PYTHON) .venv; \
+	  uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock; \
+	  uv pip install --quiet --python $(BIN)/python --no-deps -e .; \
+	else \
+	  test -x $(BIN)/python || $(PYTHON) -m venv .venv; \
+	  $(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock; \
+	  $(BIN)/python -m pip install --quiet --no-deps -e .; \
+	fi
+	@touch $@
+
+clean:
+	rm -rf .venv demo

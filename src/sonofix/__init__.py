@@ -1,0 +1,1 @@
+"""Positioning by sound: from microphone samples to a fused track."""

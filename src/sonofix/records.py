@@ -1,0 +1,320 @@
+"""The types that cross a room's door.
+
+SI units throughout; east-north-up frame; angles in radians counter-clockwise from east; times in seconds on the
+recorder's clock, where sample 0 is time 0. A microphone is a *receiver*, a beacon an *emitter*; either may be fixed
+or ride on a vehicle. Quantities that are not known are ``None``, never zero and never a silent NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.site import Site
+
+Floats = NDArray[np.float64]
+
+FixStatus = Literal["ok", "too-few", "no-convergence", "inconsistent", "ambiguous"]
+Source = Literal["fix", "fused", "predicted", "smoothed"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Waveform:
+    """One burst as a beacon sends it and a microphone hears it at rest: an envelope on a carrier.
+
+    The sound is ``Re(envelope(τ) exp(2πi carrier_hz τ))`` with τ the burst's own time, 0 at the start of its first chip.
+
+    Attributes
+    ----------
+    envelope : complex128, shape (n,)
+        Sample i stands at ``τ = start_s + i / rate_hz``; smooth enough for cubic interpolation; 0 outside.
+    signature : complex128, shape (n,)
+        The same without the part that all chips share (the mean of an on-off code): what a search correlates with.
+    rate_hz, start_s, carrier_hz : float
+    duration_s : float
+        Nominal length of the code; the burst's middle is at ``duration_s / 2``.
+    """
+
+    envelope: NDArray[np.complex128]
+    signature: NDArray[np.complex128]
+    rate_hz: float
+    start_s: float
+    carrier_hz: float
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeRows:
+    """Ranges that a recording states instead of samples; ``sd_m`` holds NaN where a row states none."""
+
+    time_s: Floats
+    emitter: tuple[str, ...]
+    receiver: tuple[str, ...]
+    range_m: Floats
+    sd_m: Floats | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """One of the recording's sensor files: named columns of equal length, NaN where a cell is empty.
+
+    ``vehicle`` (or ``from``/``to`` in ``names``) are text columns; all others are float64 arrays.
+    """
+
+    columns: Mapping[str, Floats]
+    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """One run of a system: what stands where, and samples or ranges.
+
+    Attributes
+    ----------
+    site : Site
+    rate_hz : float or None
+        Sample rate; None where the recording has no samples.
+    sample_count : int or None
+        As the file's header states; the blocks may hold fewer (a cut-off file), never more.
+    blocks : callable or None
+        ``blocks(n)`` iterates over float32 arrays of shape (≤ n, channels), full scale ±1, from sample 0 on.
+    sync_s : float64 (epochs,) or None
+        When each sync command arrived; None: epochs start at sample 0 and every period.
+    ranges : RangeRows or None
+    tables : mapping from file stem ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings",
+        "exchanges") to Table
+    """
+
+    site: Site
+    rate_hz: float | None = None
+    sample_count: int | None = None
+    blocks: Callable[[int], Iterator[NDArray[np.float32]]] | None = None
+    sync_s: Floats | None = None
+    ranges: RangeRows | None = None
+    tables: Mapping[str, Table] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """The true poses of one vehicle's origin: ``position_m`` (n, 3), ``yaw_rad`` (n,) unwrapped or None."""
+
+    vehicle: str
+    time_s: Floats
+    position_m: Floats
+    yaw_rad: Floats | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where a burst is expected: the last estimate seen from one emitter–receiver pair (warm search).
+
+    ``arrival_s`` is the moment the middle of the burst is heard, recorder's clock; ``range_rate_mps`` the
+    derivative of the heard range, positive when receding.
+    """
+
+    emitter: str
+    receiver: str
+    arrival_s: float
+    arrival_sd_s: float
+    range_rate_mps: float
+    range_rate_sd_mps: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """One way the sound took: delay after the reported arrival (negative: before it) and strength relative to it."""
+
+    delay_s: float
+    gain_db: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """One burst heard by one microphone.
+
+    Attributes
+    ----------
+    emitter, receiver : str
+    arrival_s : float
+        When the microphone's samples hold the middle of the burst, recorder's clock.
+    time_scale : float
+        dτ/dt of the burst's time τ against the recorder's time: 1 − range rate / c. Above 1 when approaching.
+    covariance : float64 (2, 2)
+        Of (arrival_s, time_scale), from the curvature of the likelihood and the measured noise.
+    amplitude : float
+        Of the burst's envelope at the microphone, in full scales per unit of the replica's envelope.
+    snr_db : float
+        Mean burst power over the noise power in the search band.
+    paths : tuple of Path
+    """
+
+    emitter: str
+    receiver: str
+    arrival_s: float
+    time_scale: float
+    covariance: Floats
+    amplitude: float
+    snr_db: float
+    paths: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Acquisition:
+    """All that was heard in one epoch. ``flags`` say in plain words what was odd about its samples."""
+
+    index: int
+    sync_s: float
+    detections: tuple[Detection, ...]
+    flags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeEpoch:
+    """Ranges of one epoch, a row an emitter–receiver pair.
+
+    One instant defines a row: ``time_s`` = t is when the receiver hears the middle of the burst and
+    ``range_m`` = ``|p_receiver(t) − p_emitter(t − range / c)|`` (plus ``clock_offset`` where ``clock`` is "common").
+
+    Attributes
+    ----------
+    index : int
+    sync_s : float
+        When the epoch began, recorder's clock.
+    emitter, receiver : tuple of str, length n
+    time_s, range_m : float64 (n,)
+    covariance_m2 : float64 (n, n)
+        Of ``range_m``, full: rows may share noise.
+    range_rate_mps, range_rate_sd_mps, snr_db : float64 (n,) or None
+        Derivative of ``range_m`` in t, positive when receding.
+    clock : "known" or "common"
+        "common": all rows share one unknown offset ``clock_offset_m``; true range = range_m − clock_offset_m.
+    sound_speed_mps : float
+        The speed that made ranges of the delays.
+    flags : tuple of str
+    """
+
+    index: int
+    sync_s: float
+    emitter: tuple[str, ...]
+    receiver: tuple[str, ...]
+    time_s: Floats
+    range_m: Floats
+    covariance_m2: Floats
+    range_rate_mps: Floats | None
+    range_rate_sd_mps: Floats | None
+    snr_db: Floats | None
+    clock: Literal["known", "common"]
+    sound_speed_mps: float
+    flags: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.emitter)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """Position of one vehicle from one epoch's ranges alone.
+
+    Attributes
+    ----------
+    time_s : float
+        The instant the state belongs to (the mean of the moments its rows speak of).
+    vehicle : str
+    status : "ok" or why not; ``remedy`` says in one sentence what would help
+    states : tuple of str
+        Names of the rows of ``covariance``, among x, y, z, yaw, clock, vx, vy, vz.
+    position_m : float64 (3,) or None
+        Of the vehicle's origin; None unless the status is "ok" or "inconsistent".
+    velocity_mps : float64 (3,) or None
+    yaw_rad, clock_offset_m : float or None
+    covariance : float64 (k, k) or None
+        In m, rad, m and m/s, rows as ``states``.
+    hdop, vdop : float or None
+        Of unit range variances; vdop is None where the level is known.
+    hpl_m, vpl_m : float or None
+        Protection levels; None where integrity cannot be judged.
+    used : bool (n,)
+        For each row of the RangeEpoch whether the position rests on it.
+    residual_m : float64 (n,)
+        Measured less computed range; NaN where no position was found.
+    mirror_m : float64 (3,) or None
+        The other solution where geometry leaves two.
+    """
+
+    time_s: float
+    vehicle: str
+    status: FixStatus
+    remedy: str
+    states: tuple[str, ...]
+    position_m: Floats | None
+    velocity_mps: Floats | None
+    yaw_rad: float | None
+    clock_offset_m: float | None
+    covariance: Floats | None
+    hdop: float | None
+    vdop: float | None
+    hpl_m: float | None
+    vpl_m: float | None
+    used: NDArray[np.bool_]
+    residual_m: Floats
+    mirror_m: Floats | None = None
+
+    def sd(self, state: str) -> float | None:
+        """Return the standard deviation of a state by name, None where it is not estimated."""
+        if self.covariance is None or state not in self.states:
+            return None
+        i = self.states.index(state)
+        return float(np.sqrt(self.covariance[i, i]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The track of one vehicle at one instant: what its filter believes.
+
+    ``states`` names the rows of ``covariance`` (x, y, z, yaw, clock, vx, vy, vz as estimated); the pose is that of the
+    vehicle's origin. ``source``: "fix" or "fused" where a measurement entered, "predicted" where none did.
+    """
+
+    time_s: float
+    vehicle: str
+    states: tuple[str, ...]
+    position_m: Floats
+    velocity_mps: Floats
+    yaw_rad: float | None
+    clock_offset_m: float | None
+    covariance: Floats
+    source: Source
+
+    def sd(self, state: str) -> float | None:
+        """Return the standard deviation of a state by name, None where it is not estimated."""
+        if state not in self.states:
+            return None
+        i = self.states.index(state)
+        return float(np.sqrt(self.covariance[i, i]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Event:
+    """Something a user should know of: ``event`` is one word (lost, excluded, reset, gap, …), ``detail`` a sentence."""
+
+    time_s: float
+    vehicle: str
+    event: str
+    detail: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What one epoch brought: the row of the street from ranges to estimates."""
+
+    ranges: RangeEpoch
+    fixes: tuple[Fix, ...]
+    estimates: tuple[Estimate, ...]
+    events: tuple[Event, ...]
+    range_used: NDArray[np.bool_]
+    range_clock_offset_m: Floats
