@@ -1,0 +1,219 @@
+"""The acquisition plan: everything about a site's bursts that can be computed before the first sample comes.
+
+One epoch of one microphone is taken apart loudest first: search all beacons not yet found in what is left, accept
+those near the strongest, refine everything found so far together, subtract, and search again until nothing more stands
+above its threshold. So a beacon at 1 m does not hide one at 15 m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.acquire.bank import Bank, make_bank
+from sonofix.acquire.baseband import Band, band_limited, design_band, downconvert
+from sonofix.acquire.refine import Burst, refine
+from sonofix.acquire.search import Peak, search
+from sonofix.records import Detection, Floats, Prediction, Waveform
+
+NEAR_STRONGEST = 10 ** (-6 / 10)
+"""Accepted in one pass: correlation power within this of the strongest. m-sequences isolate 9 dB at worst, so nothing
+this close can be another beacon's cross-talk."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """What `acquire` needs to know, planned once.
+
+    Attributes
+    ----------
+    sample_rate_hz, sound_speed_mps : float
+    bands : tuple of (Band, tuple of Bank)
+        Beacons on one carrier share a band.
+    false_alarm_rate : float
+        That a silent beacon is reported, per epoch and microphone.
+    kappa_sd : float
+        Prior deviation of range acceleration over c, 1/s.
+    """
+
+    sample_rate_hz: float
+    sound_speed_mps: float
+    bands: tuple[tuple[Band, tuple[Bank, ...]], ...]
+    false_alarm_rate: float
+    kappa_sd: float
+
+    @property
+    def margin_s(self) -> float:
+        """Samples wanted before the first arrival searched, for the filters to settle."""
+        return max(len(band.taps) / band.sample_rate_hz for band, _ in self.bands)
+
+    @property
+    def burst_s(self) -> float:
+        """Longest burst, its ring and its stretch included."""
+        return max(bank.replicas.shape[1] / band.rate_hz for band, banks in self.bands for bank in banks)
+
+
+def make_plan(
+    waveforms: Mapping[str, Waveform],
+    sample_rate_hz: float,
+    sound_speed_mps: float,
+    max_rate_mps: float = 3.0,
+    max_acceleration_mps2: float = 2.0,
+    false_alarm_rate: float = 1e-4,
+) -> Plan:
+    """Plan the acquisition of a set of beacons.
+
+    Parameters
+    ----------
+    waveforms : mapping from emitter id to Waveform
+    max_rate_mps : float
+        Range rates searched: ±.
+    max_acceleration_mps2 : float
+        One-sigma range acceleration within a burst (a pass at 2 m/s and 2 m gives 2 m/s²).
+
+    Raises
+    ------
+    ValueError
+        If there is no waveform, or the sample rate is too low for a carrier.
+    """
+    if not waveforms:
+        raise ValueError("no beacon has a code, so there is nothing to listen for: give each [[beacon]] its code")
+    bands = []
+    for carrier_hz in sorted({w.carrier_hz for w in waveforms.values()}):
+        members = {k: w for k, w in waveforms.items() if w.carrier_hz == carrier_hz}
+        band = design_band(list(members.values()), sample_rate_hz)
+        banks = tuple(
+            make_bank(emitter, band_limited(w, band), band, max_rate_mps, sound_speed_mps)
+            for emitter, w in members.items()
+        )
+        bands.append((band, banks))
+    return Plan(
+        sample_rate_hz, sound_speed_mps, tuple(bands), false_alarm_rate, max_acceleration_mps2 / sound_speed_mps
+    )
+
+
+def acquire(
+    plan: Plan,
+    samples: NDArray[np.float32],
+    first_sample: int,
+    receiver: str,
+    windows: Mapping[str, tuple[float, float]],
+    predictions: Mapping[str, Prediction] | None = None,
+) -> tuple[Detection, ...]:
+    """All bursts that one microphone heard in one epoch.
+
+    Parameters
+    ----------
+    samples : float32 (n,)
+        One channel around the epoch; index 0 is sample ``first_sample`` of the recording.
+    receiver : str
+        The microphone's id.
+    windows : mapping from emitter id to (opens_s, closes_s)
+        When its burst may begin to be heard, recorder's clock. Emitters not named are not searched.
+    predictions : mapping from emitter id to Prediction
+        Warm search: delay and range rate only within five deviations of what is expected.
+
+    Returns
+    -------
+    tuple of Detection, strongest first
+    """
+    found: list[tuple[Burst, Detection]] = []
+    for band, banks in plan.bands:
+        baseband, start_s = downconvert(samples, first_sample, band)
+        if len(baseband):
+            listening = [b for b in banks if b.emitter in windows]
+            found += _take_apart(plan, band, listening, baseband, start_s, receiver, windows, predictions or {})
+    found.sort(key=lambda pair: -abs(pair[0].gain))
+    return tuple(detection for _, detection in found)
+
+
+def _take_apart(
+    plan: Plan,
+    band: Band,
+    banks: list[Bank],
+    baseband: NDArray[np.complex128],
+    start_s: float,
+    receiver: str,
+    windows: Mapping[str, tuple[float, float]],
+    predictions: Mapping[str, Prediction],
+) -> list[tuple[Burst, Detection]]:
+    bursts: list[Burst] = []
+    heard: list[Bank] = []
+    covariances: list[Floats] = []
+    noise = np.zeros(0)
+    residual = baseband
+    waiting = list(banks)
+    while waiting:
+        peaks = [(b, p) for b in waiting if (p := _search(plan, band, b, residual, start_s, windows, predictions))]
+        peaks = [(b, p) for b, p in peaks if p.found]
+        if not peaks:
+            break
+        strongest = max(p.power for _, p in peaks)
+        accepted = [(b, p) for b, p in peaks if p.power >= NEAR_STRONGEST * strongest]
+        for bank, peak in accepted:
+            beta = peak.range_rate_mps / plan.sound_speed_mps
+            middle_s = peak.start_s + bank.waveform.duration_s / 2
+            bursts.append(Burst(bank.waveform, middle_s, beta, 0.0, 0j))
+            heard.append(bank)
+            waiting.remove(bank)
+        bursts, covariances, residual, noise = refine(
+            baseband, start_s, band.rate_hz, bursts, plan.kappa_sd, band.whiteness
+        )
+    return [
+        (burst, _detection(burst, bank, receiver, covariance, power, band))
+        for burst, bank, covariance, power in zip(bursts, heard, covariances, noise, strict=True)
+        if _whole(burst, baseband, start_s, band)
+    ]
+
+
+def _search(
+    plan: Plan,
+    band: Band,
+    bank: Bank,
+    residual: NDArray[np.complex128],
+    start_s: float,
+    windows: Mapping[str, tuple[float, float]],
+    predictions: Mapping[str, Prediction],
+) -> Peak | None:
+    opens_s, closes_s = windows[bank.emitter]
+    rates = None
+    expected = predictions.get(bank.emitter)
+    if expected is not None:
+        begins_s = expected.arrival_s - bank.waveform.duration_s / 2
+        reach_s = 5 * expected.arrival_sd_s + 2 / band.rate_hz
+        opens_s, closes_s = max(opens_s, begins_s - reach_s), min(closes_s, begins_s + reach_s)
+        reach = 5 * expected.range_rate_sd_mps
+        rates = (expected.range_rate_mps - reach, expected.range_rate_mps + reach)
+    return search(residual, start_s, bank, band, opens_s, closes_s, rates, plan.false_alarm_rate)
+
+
+def _whole(burst: Burst, baseband: NDArray[np.complex128], start_s: float, band: Band) -> bool:
+    """Whether the samples hold the burst from its first chip to its last."""
+    half_s = burst.waveform.duration_s / 2
+    end_s = start_s + (len(baseband) - 1) / band.rate_hz
+    return burst.arrival_s - half_s >= start_s - 2 / band.rate_hz and burst.arrival_s + half_s <= end_s + 2 / band.rate_hz
+
+
+def _detection(
+    burst: Burst, bank: Bank, receiver: str, covariance: Floats, noise: float, band: Band
+) -> Detection:
+    # β and the time scale differ in sign
+    sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    inside = slice(
+        int(-burst.waveform.start_s * burst.waveform.rate_hz),
+        int((burst.waveform.duration_s - burst.waveform.start_s) * burst.waveform.rate_hz),
+    )
+    power = abs(burst.gain) ** 2 * float(np.mean(np.abs(burst.waveform.envelope[inside]) ** 2))
+    in_band = noise / band.whiteness
+    return Detection(
+        emitter=bank.emitter,
+        receiver=receiver,
+        arrival_s=burst.arrival_s,
+        time_scale=1.0 - burst.beta,
+        covariance=covariance * sign,
+        amplitude=abs(burst.gain),
+        snr_db=float(10 * np.log10(max(power, 1e-30) / in_band)),
+    )
