@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sonofix.site import Site
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating]
 
 FixStatus = Literal["ok", "too-few", "no-convergence", "inconsistent", "ambiguous"]
 Source = Literal["fix", "fused", "predicted", "smoothed"]
@@ -26,7 +26,8 @@ Source = Literal["fix", "fused", "predicted", "smoothed"]
 class Waveform:
     """One burst as a beacon sends it and a microphone hears it at rest: an envelope on a carrier.
 
-    The sound is ``Re(envelope(τ) exp(2πi carrier_hz τ))`` with τ the burst's own time, 0 at the start of its first chip.
+    With τ the burst's own time, 0 at the start of its first chip, the sound is
+    ``Re(envelope(τ) exp(2πi carrier_hz τ))``.
 
     Attributes
     ----------

@@ -59,7 +59,7 @@ def velocity_step_mps(waveform: Waveform, sound_speed_mps: float) -> float:
     sinc(f δ T / c) (the stretch itself costs less by the ratio of bandwidth to carrier).
     """
     x = np.linspace(0.0, 1.0, 4001)
-    allowed = x[np.searchsorted(-np.sinc(x) ** 2, -(10 ** (-LOSS_DB / 10)))]
+    allowed = x[np.searchsorted(-(np.sinc(x) ** 2), -(10 ** (-LOSS_DB / 10)))]
     return float(2.0 * allowed * sound_speed_mps / (waveform.carrier_hz * waveform.duration_s))
 
 

@@ -90,9 +90,7 @@ def design_band(waveforms: list[Waveform], sample_rate_hz: float) -> Band:
     n = np.arange(count) - (count - 1) / 2
     cutoff = (half_width_hz + transition_hz / 2) / sample_rate_hz
     taps = np.kaiser(count, beta) * np.sinc(2 * cutoff * n)
-    return Band(
-        carrier_hz, half_width_hz, sample_rate_hz, decimation, (2.0 * taps / np.sum(taps)).astype(np.float32)
-    )
+    return Band(carrier_hz, half_width_hz, sample_rate_hz, decimation, (2.0 * taps / np.sum(taps)).astype(np.float32))
 
 
 def _half_width(waveform: Waveform) -> float:

@@ -194,12 +194,12 @@ def _whole(burst: Burst, baseband: NDArray[np.complex128], start_s: float, band:
     """Whether the samples hold the burst from its first chip to its last."""
     half_s = burst.waveform.duration_s / 2
     end_s = start_s + (len(baseband) - 1) / band.rate_hz
-    return burst.arrival_s - half_s >= start_s - 2 / band.rate_hz and burst.arrival_s + half_s <= end_s + 2 / band.rate_hz
+    return (
+        burst.arrival_s - half_s >= start_s - 2 / band.rate_hz and burst.arrival_s + half_s <= end_s + 2 / band.rate_hz
+    )
 
 
-def _detection(
-    burst: Burst, bank: Bank, receiver: str, covariance: Floats, noise: float, band: Band
-) -> Detection:
+def _detection(burst: Burst, bank: Bank, receiver: str, covariance: Floats, noise: float, band: Band) -> Detection:
     # β and the time scale differ in sign
     sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
     inside = slice(

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from sonofix.records import Floats, Waveform
 from sonofix.signals.interpolate import read, read_slope
 
-
 STEP_LIMIT = np.array([1e-4, 3e-4, 1e-1])
 """Of one iteration in arrival (s), β and κ (1/s)."""
 

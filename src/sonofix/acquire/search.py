@@ -42,8 +42,9 @@ def search(
     rates: tuple[float, float] | None,
     false_alarm_rate: float,
 ) -> Peak | None:
-    """Highest correlation of one emitter's burst starting within [opens_s, closes_s]; the literal search of the seed,
-    eqs 4–6, with its window stretched and its mean removed.
+    """Find the highest correlation of one emitter's burst starting within [opens_s, closes_s].
+
+    The search of the first seed, eqs 4–6, with its window stretched and its mean removed.
 
     Parameters
     ----------
@@ -73,9 +74,9 @@ def search(
         rows = slice(low, max(high, low + 1))
     count = last - first + 1
     stretch = baseband[first : last + bank.replicas.shape[1]].astype(np.complex64)
-    length = scipy.fft.next_fast_len(len(stretch) + 1)
-    spectrum = scipy.fft.fft(stretch, length)
-    surface = scipy.fft.ifft(spectrum[None, :] * bank.spectra(length, rows), axis=-1, overwrite_x=True)[:, :count]
+    length = int(scipy.fft.next_fast_len(len(stretch) + 1) or 0)
+    spectrum = np.asarray(scipy.fft.fft(stretch, length))
+    surface = scipy.fft.ifft(spectrum * bank.spectra(length, rows), axis=-1, overwrite_x=True)[:, :count]
     power = surface.real**2 + surface.imag**2
     row, column = np.unravel_index(int(np.argmax(power)), power.shape)
     noise = float(np.median(power)) / np.log(2.0)

@@ -182,7 +182,7 @@ def m_sequence(degree: int, taps: Iterable[int]) -> Chips:
         examples = ", ".join(str(list(t)) for t in known[:3])
         raise ValueError(
             f"taps = {list(checked)} of degree {degree} are not primitive: the sequence would repeat before"
-            f" {2**degree - 1} chips; choose one of the {len(known)} sets of primitive_taps({degree}), such as {examples}"
+            f" {2**degree - 1} chips; choose one of the {len(known)} sets of primitive_taps({degree}), as {examples}"
         )
     register, mask = (1 << degree) - 1, 1 | sum(1 << t for t in checked)
     chips = bytearray(2**degree - 1)

@@ -54,7 +54,7 @@ def chips_of(beacon: Beacon) -> NDArray[np.int8] | None:
     return None
 
 
-def resonance(offset_hz: Floats, bandwidth_hz: float) -> NDArray[np.complex128]:
+def resonance(offset_hz: Floats, bandwidth_hz: float) -> NDArray[np.complexfloating]:
     """Response of one transducer to its envelope, at offsets from its resonance: ``1 / (1 + j f / (B/2))``.
 
     The narrow-band form of a resonator of −3 dB width B: one pole, time constant 1 / (π B), gain 1 at the resonance.
@@ -166,7 +166,9 @@ def waveform_of(
     signal = site.signal_of(beacon)
     if isinstance(beacon.code, ReferenceCode):
         if reference is None:
-            raise ValueError(f"beacon {beacon.id}: its code is the recording {beacon.code.reference}, which was not given")
+            raise ValueError(
+                f"beacon {beacon.id}: its code is the recording {beacon.code.reference}, which was not given"
+            )
         return reference_waveform(
             reference, signal, sound_speed_mps, beacon.code.distance_m or 0.0, beacon.code.start_s or 0.0
         )

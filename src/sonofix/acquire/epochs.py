@@ -1,0 +1,123 @@
+"""When to listen: the window of each epoch, from sync commands, the schedule, or the samples themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Floats
+from sonofix.site import Site
+
+CLIPPED = 0.9995
+"""Of full scale: at or above, a sample counts as clipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Bursts of one epoch begin to be heard within [opens_s, closes_s], their offsets and delays aside.
+
+    ``sync_s`` is what ranges are measured from; ``seeking`` marks the search for an unknown clock's phase.
+    """
+
+    index: int
+    sync_s: float
+    opens_s: float
+    closes_s: float
+    seeking: bool = False
+
+
+def reach_s(site: Site, sound_speed_mps: float) -> float:
+    """Longest flight worth waiting for: the diagonal of all that is fixed and half as much again, 5 m at least.
+
+    Where too little is fixed to tell, 40 m, beyond which 40 kHz has lost 85 dB to spreading and air.
+    """
+    points = [n.position_m for n in (*site.beacons, *site.microphones) if n.position_m is not None]
+    points += list(site.bounds_m or ())
+    if len(points) < 2:
+        return 40.0 / sound_speed_mps
+    span = np.ptp(np.array(points), axis=0)
+    return (1.5 * float(np.linalg.norm(span)) + 5.0) / sound_speed_mps
+
+
+class Schedule:
+    """Walks through the epochs of a recording.
+
+    With a common clock, windows follow sync commands or the period from sample 0 on. With an unknown one, the first
+    window spans a whole period; where bursts stand in it, later windows are laid round their successors.
+
+    Parameters
+    ----------
+    period_s : float
+    reach : float
+        Longest flight, s.
+    sync_s : float64 (epochs,) or None
+    known : bool
+        Whether bursts start at the sync command (else the offset is unknown).
+    regular : bool
+        Unknown clock: whether one offset holds throughout (fixed beacons), or another each burst (free-running).
+    """
+
+    def __init__(self, period_s: float, reach: float, sync_s: Floats | None, known: bool, regular: bool) -> None:
+        self._period_s = period_s
+        self._sync_s = sync_s if known else None
+        self._known, self._regular = known, regular
+        self._reach_s = min(reach, period_s) if known else min(reach, period_s / 2)
+        self._index = 0
+        self._seek_s = 0.0
+        self._first_s: float | None = None
+        self._base_s = 0.0
+
+    def window(self) -> Window | None:
+        """Return the next window; None after the last sync command."""
+        if self._known:
+            if self._sync_s is None:
+                sync_s = self._index * self._period_s
+            elif self._index < len(self._sync_s):
+                sync_s = float(self._sync_s[self._index])
+            else:
+                return None
+            return Window(self._index, sync_s, sync_s, sync_s + self._reach_s)
+        if self._first_s is None:
+            return Window(self._index, self._seek_s, self._seek_s, self._seek_s + self._period_s, seeking=True)
+        opens_s, closes_s = self._first_s - self._reach_s, self._first_s + self._reach_s
+        sync_s = self._base_s + self._index * self._period_s if self._regular else opens_s
+        return Window(self._index, sync_s, opens_s, closes_s)
+
+    def found(self, starts_s: Floats) -> None:
+        """Tell when the bursts of the seeking window were heard to begin: they cluster, modulo the period."""
+        if not len(starts_s):
+            self._seek_s += self._period_s
+            return
+        order = np.sort(starts_s)
+        gaps = np.diff(np.append(order, order[0] + self._period_s))
+        after = (int(np.argmax(gaps)) + 1) % len(order)
+        # the window may have opened amid the bursts of an epoch: begin with the first that can be whole
+        periods = np.floor(order[after] / self._period_s)
+        self._first_s = float(order[after] - periods * self._period_s)
+        if self._seek_s > 0.0:
+            self._first_s = float(order[after])
+        self._base_s = self._first_s - self._reach_s
+
+    def done(self, starts_s: Floats) -> None:
+        """Tell when the bursts of the last window were heard to begin, and go on to the next."""
+        self._index += 1
+        if self._first_s is not None:
+            heard = float(np.min(starts_s)) if len(starts_s) else self._first_s
+            self._first_s = heard + self._period_s
+
+
+def screen(samples: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Samples fit to be filtered, and what was wrong with them: not finite (set to 0), clipped, or silent."""
+    flags = []
+    finite = np.isfinite(samples)
+    if not finite.all():
+        flags.append(f"{np.sum(~finite)} of {samples.size} samples are not finite; taken as silence")
+        samples = np.where(finite, samples, np.float32(0))
+    clipped = np.abs(samples) >= CLIPPED
+    if clipped.mean() > 1e-4:
+        flags.append(f"{100 * clipped.mean():.2f} % of samples are clipped; lower the gain")
+    if not samples.any():
+        flags.append("no sound at all: every sample is 0")
+    return samples, tuple(flags)

@@ -1,0 +1,316 @@
+"""`sonofix simulate`: make a recording folder from a site file and motions, with the truth beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sonofix.channel import Motion
+    from sonofix.records import Recording, Truth, Waveform
+    from sonofix.signals.waveform import ReferenceBurst
+    from sonofix.site import Site
+
+MOTION_HELP = """How the vehicle moves; lengths in m, speeds in m/s. still:x,y · line:x,y,vx,vy · circle:cx,cy,r,speed
+(speed < 0: clockwise) · waypoints:x1,y1;x2,y2;…@speed (corners are rounded; ends where it began: laps) ·
+csv:FILE (columns time_s, x_m, y_m and, if you like, z_m, yaw_rad; stands before its first row and after its last).
+Repeat it for several vehicles."""
+
+
+def simulate(
+    site: Annotated[Path, typer.Argument(help="Site file (site.toml): what stands where, what it sends, what moves.")],
+    out: Annotated[Path, typer.Argument(help="Folder to write: site.toml, capture.wav, truth.csv (and sync.csv).")],
+    motion: Annotated[list[str] | None, typer.Option(help=MOTION_HELP)] = None,
+    vehicle: Annotated[
+        list[str] | None, typer.Option(help="Vehicle that a --motion is of, one for each, in the same order.")
+    ] = None,
+    z: Annotated[float, typer.Option(help="Height in m of vehicles whose z_m the site does not state.")] = 0.0,
+    duration: Annotated[float, typer.Option(help="Length in s.")] = 10.0,
+    rate: Annotated[int, typer.Option(help="Samples a second.")] = 192000,
+    snr: Annotated[
+        float | None,
+        typer.Option(help="Mean power of the median burst over the noise in the whole band, dB.", show_default="10"),
+    ] = None,
+    noise_db: Annotated[
+        float | None, typer.Option(help="Noise, dB of full scale (rms), in place of --snr; -inf for none.")
+    ] = None,
+    level: Annotated[
+        float | None,
+        typer.Option(
+            help="Amplitude of a beacon at 1 m, full scale 1.",
+            show_default="as loud as keeps all sounds together below half scale",
+        ),
+    ] = None,
+    echo: Annotated[
+        float, typer.Option(help="What the six surfaces of the room (bounds_m) reflect, of the amplitude: 0 to 1.")
+    ] = 0.0,
+    absorption: Annotated[
+        float | None, typer.Option(help="Absorption in dB/m.", show_default="ISO 9613-1 for the site's air")
+    ] = None,
+    tone_hz: Annotated[float | None, typer.Option(help="Frequency in Hz of an interfering tone.")] = None,
+    tone_db: Annotated[float, typer.Option(help="Its amplitude, dB of full scale.")] = -20.0,
+    clock_offset: Annotated[
+        float,
+        typer.Option(
+            help="Start of the first epoch on the recorder's clock, s; unknown where beacons are not in sync."
+        ),
+    ] = 0.0,
+    clock_ppm: Annotated[
+        float, typer.Option(help="How much longer the beacons' second is than the recorder's, millionths.")
+    ] = 0.0,
+    sync_jitter: Annotated[
+        float, typer.Option(help="Standard deviation in s of sync commands; sync.csv tells when they came.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(help="Same seed, same noise.")] = 0,
+    flac: Annotated[bool, typer.Option("--flac", help="Write capture.flac: smaller, at most 8 channels.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a recording that is there already.")] = False,
+) -> None:
+    """Make a recording folder: what the site's microphones would hear, 16 bit, and the truth beside it.
+
+    Sound is followed sample by sample from moving emitters to moving microphones. For example, a lap of a hall:
+
+    sonofix simulate hall.toml lap --motion "waypoints:1,1;9,1;9,7;1,7;1,1@1.2" --snr 6
+    """
+    from sonofix import files
+
+    if snr is not None and noise_db is not None:
+        _refuse("--snr and --noise-db both set the noise; give one of them")
+    try:
+        plan = files.read_site(site)
+        references = files.read_references(site.parent, plan)
+        _check_folder(site, out, force)
+        motions = _motions(plan, motion or [], vehicle or [], z)
+        waveforms = _waveforms(plan, references)
+        recording, truth = _made(
+            plan,
+            motions,
+            waveforms,
+            duration_s=duration,
+            rate_hz=rate,
+            snr_db=10.0 if snr is None else snr,
+            noise_db=noise_db,
+            level=level,
+            echo=echo,
+            absorption=absorption,
+            tone=None if tone_hz is None else (tone_hz, 10 ** (tone_db / 20)),
+            clock=(clock_offset, 1e-6 * clock_ppm, sync_jitter),
+            seed=seed,
+        )
+        _write(out, recording, truth, references, flac, force)
+    except files.RecordingError as error:
+        for problem in error.problems:
+            typer.echo(str(problem), err=True)
+        raise typer.Exit(2) from None
+    except ValueError as error:
+        _refuse(str(error))
+    heard = sum(m.channel is not None for m in plan.microphones)
+    typer.echo(
+        f"{out}: {duration:g} s at {rate} Hz, {len(waveforms)} beacon{'s' * (len(waveforms) != 1)}, "
+        f"{heard} microphone{'s' * (heard != 1)}, {len(truth)} vehicle{'s' * (len(truth) != 1)}"
+    )
+
+
+def _refuse(sentence: str) -> NoReturn:
+    typer.echo(" ".join(sentence.split()), err=True)
+    raise typer.Exit(2)
+
+
+def _check_folder(site: Path, out: Path, force: bool) -> None:
+    """Refuse to write over the site file itself, or beside sensor files that another run measured."""
+    if site.resolve() == (out / "site.toml").resolve():
+        _refuse(f"{out}: holds the site file itself, which would be rewritten; write to another folder")
+    if (out / "site.toml").exists():
+        if not force:
+            _refuse(f"{out}: is a recording already; write to another folder, or give --force to replace it")
+        from sonofix.files.recording import SENSOR_FILES
+
+        others = [f"{stem}.csv" for stem in ("ranges", *SENSOR_FILES) if (out / f"{stem}.csv").exists()]
+        if others:
+            _refuse(f"{out}: holds {', '.join(others)}, which would not fit new samples; move it away first")
+
+
+def _motions(site: Site, told: list[str], ids: list[str], z_m: float) -> dict[str, Motion]:
+    known = [v.id for v in site.vehicles]
+    names = ids or known[:1]
+    listed = ", ".join(known) or "none"
+    if not known and not told:
+        return {}
+    if len(names) != len(told):
+        _refuse(
+            f"--motion is given {len(told)} times, for {len(names)} vehicle{'s' * (len(names) != 1)}; the site's "
+            f"vehicles are {listed}: name each with --vehicle and give it a --motion"
+        )
+    for name in names:
+        if name not in known:
+            _refuse(f"--vehicle {name}: the site has no such vehicle; it has {listed}")
+        if names.count(name) > 1:
+            _refuse(f"--vehicle {name}: is given twice; a vehicle has one motion")
+    left = [name for name in known if name not in names]
+    if left:
+        _refuse(f"--motion: none for vehicle {', '.join(left)}; give each vehicle one, with --vehicle")
+    levels = {v.id: z_m if v.z_m is None else v.z_m for v in site.vehicles}
+    return {name: parse_motion(text, levels[name], site, name) for name, text in zip(names, told, strict=True)}
+
+
+def parse_motion(text: str, z_m: float, site: Site, vehicle: str) -> Motion:
+    """Return the motion that a ``--motion`` tells, on the level ``z_m`` where the text names no height.
+
+    Raises
+    ------
+    ValueError
+        Saying how it is written right.
+    """
+    from sonofix.channel import Circle, Line, Still, Waypoints
+
+    kind, _, rest = text.partition(":")
+    try:
+        if kind == "still":
+            x, y, height = _numbers(rest, 2, 3, z_m)
+            return Still((x, y, height))
+        if kind == "line":
+            x, y, vx, vy = _numbers(rest, 4, 4)
+            return Line((x, y, z_m), (vx, vy, 0.0))
+        if kind == "circle":
+            x, y, radius, speed = _numbers(rest, 4, 4)
+            return Circle((x, y, z_m), radius, speed)
+        if kind == "waypoints":
+            places, at, speed = rest.rpartition("@")
+            if not at:
+                raise ValueError("no speed; end it with @ and the speed in m/s")
+            points = [_numbers(place, 2, 3, z_m) for place in places.split(";")]
+            return Waypoints(tuple((x, y, height) for x, y, height in points), _numbers(speed, 1, 1)[0])
+    except ValueError as error:
+        raise ValueError(f"--motion {text}: {error}") from None
+    if kind == "csv":
+        return _sampled(Path(rest), z_m, site, vehicle)
+    raise ValueError(
+        f"--motion {text}: no such motion; write still:x,y or line:x,y,vx,vy or circle:cx,cy,r,speed or "
+        "waypoints:x1,y1;x2,y2@speed or csv:FILE"
+    )
+
+
+def _numbers(text: str, least: int, most: int, last: float = 0.0) -> list[float]:
+    """Numbers parted by commas; where one fewer than ``most`` came, ``last`` is added."""
+    parts = text.split(",")
+    try:
+        values = [float(part) for part in parts]
+    except ValueError:
+        raise ValueError(f'"{text}" is not numbers parted by commas') from None
+    if not least <= len(values) <= most:
+        count = f"{least}" if least == most else f"{least} or {most}"
+        raise ValueError(f'"{text}" holds {len(values)} numbers; {count} are needed')
+    return values + [last] * (most - len(values))
+
+
+def _sampled(path: Path, z_m: float, site: Site, vehicle: str) -> Motion:
+    import numpy as np
+
+    from sonofix.channel import Sampled
+    from sonofix.files.tables import Layout, read_table
+
+    layout = Layout(
+        ("time_s", "x_m", "y_m"),
+        ("z_m", "yaw_rad"),
+        given=("time_s", "x_m", "y_m"),
+        per_vehicle=True,
+        key="vehicle",
+        strictly=True,
+    )
+    table = read_table(path, layout, site)
+    rows = np.array(table.names["vehicle"]) == vehicle
+    columns = {name: values[rows] for name, values in table.columns.items()}
+    height = columns.get("z_m", np.full(int(rows.sum()), z_m))
+    yaw = columns.get("yaw_rad")
+    try:
+        position = np.column_stack([columns["x_m"], columns["y_m"], height])
+        return Sampled(columns["time_s"], position, None if yaw is None else np.unwrap(yaw))
+    except ValueError as error:
+        raise ValueError(f"{path.name}: vehicle {vehicle}: {error}") from None
+
+
+def _waveforms(site: Site, references: Mapping[str, ReferenceBurst]) -> dict[str, Waveform]:
+    from sonofix.channel.simulate import sound_speed_of
+    from sonofix.signals.waveform import waveform_of
+
+    if not site.coded_beacons:
+        raise ValueError("site.toml: no beacon has a code, so none makes a sound; give one a code")
+    speed = sound_speed_of(site)
+    return {b.id: waveform_of(site, b, speed, references.get(b.id)) for b in site.coded_beacons}
+
+
+def _made(
+    site: Site,
+    motions: Mapping[str, Motion],
+    waveforms: Mapping[str, Waveform],
+    *,
+    duration_s: float,
+    rate_hz: int,
+    snr_db: float,
+    noise_db: float | None,
+    level: float | None,
+    echo: float,
+    absorption: float | None,
+    tone: tuple[float, float] | None,
+    clock: tuple[float, float, float],
+    seed: int,
+) -> tuple[Recording, dict[str, Truth]]:
+    from sonofix import channel
+
+    if not 0 < duration_s < float("inf"):
+        raise ValueError(f"--duration {duration_s:g}: it must be positive, in s")
+    if not 0 <= echo <= 1:
+        raise ValueError(f"--echo {echo:g}: a reflection coefficient lies from 0 to 1")
+    gains = channel.direct_gains(site, motions, waveforms, duration_s, absorption)
+    if level is None:
+        level = channel.level_below(0.5, gains, waveforms, echo)
+    noise = channel.noise_for_snr(snr_db, level, gains, waveforms) if noise_db is None else 10 ** (noise_db / 20)
+    offset_s, drift, jitter_s = clock
+    return channel.simulate(
+        site,
+        motions,
+        rate_hz=rate_hz,
+        duration_s=duration_s,
+        waveforms=waveforms,
+        noise_sd=noise,
+        echo=echo,
+        level=level,
+        tone=None if tone is None else channel.Tone(*tone),
+        absorption_db_per_m=absorption,
+        clock_offset_s=offset_s,
+        clock_drift=drift,
+        sync_jitter_s=jitter_s,
+        seed=seed,
+    )
+
+
+def _write(
+    out: Path,
+    recording: Recording,
+    truth: Mapping[str, Truth],
+    references: Mapping[str, ReferenceBurst],
+    flac: bool,
+    force: bool,
+) -> None:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    from sonofix.files import write_recording
+
+    if force and recording.sync_s is None:
+        (out / "sync.csv").unlink(missing_ok=True)  # an earlier recording's would rule the new samples
+    columns = (TextColumn("simulating"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=recording.sample_count)
+        write_recording(
+            out,
+            recording,
+            truth,
+            audio="flac" if flac else "wav",
+            references=references,
+            overwrite=force,
+            on_block=lambda count: bar.update(task, completed=count),
+        )

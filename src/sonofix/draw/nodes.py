@@ -1,0 +1,105 @@
+"""What stands still: beacons, the sound that leaves them, and fixed microphones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+
+from sonofix.draw import style
+from sonofix.records import Floats
+
+_CROWD = 24
+
+
+def draw_rings(axes: Axes, emitters: Mapping[str, Floats], size_m: float) -> None:
+    """Draw the sound that leaves the beacons: circles that fade with distance."""
+    if len(emitters) > _CROWD:
+        return
+    for place in emitters.values():
+        for i in range(1, 10):
+            axes.add_patch(
+                Circle(
+                    (float(place[0]), float(place[1])),
+                    i * size_m / 36,
+                    facecolor="none",
+                    edgecolor=style.USED,
+                    linewidth=0.9,
+                    alpha=0.38 * (1 - i / 10) ** 1.4,
+                    zorder=1,
+                )
+            )
+
+
+def draw_nodes(axes: Axes, beacons: Mapping[str, Floats], microphones: Mapping[str, Floats], size_m: float) -> None:
+    """Mark and name beacons and fixed microphones; neighbours too close to write at share one label.
+
+    Names stand on the far side of the node seen from the middle of all, with the height below them.
+    """
+    everything = [*beacons.values(), *microphones.values()]
+    if not everything:
+        return
+    centre = (np.min(everything, axis=0) + np.max(everything, axis=0))[:2] / 2
+    for nodes, marker, colour in ((beacons, "^", style.USED), (microphones, "s", style.GOOD)):
+        if not nodes:
+            continue
+        at, crowd = np.array(list(nodes.values())), len(nodes) > _CROWD
+        axes.scatter(at[:, 0], at[:, 1], s=70 if crowd else 330, color=colour, alpha=0.17, linewidths=0, zorder=5)
+        axes.scatter(
+            at[:, 0],
+            at[:, 1],
+            s=30 if crowd else 85,
+            marker=marker,
+            color=colour,
+            edgecolors=style.GROUND,
+            linewidths=1.0,
+            zorder=6,
+        )
+        heights = bool(np.any(at[:, 2] != 0)) and not crowd
+        for names, place in _clusters(nodes, 0.03 * size_m):
+            _label(axes, names, place, place[:2] - centre, colour, heights, 9 if crowd else 11)
+
+
+def _label(
+    axes: Axes, names: list[str], place: Floats, away: Floats, colour: str, height: bool, size_pt: float
+) -> None:
+    away = away / (np.linalg.norm(away) or 1.0)
+    vertical = 1 if away[1] > 0.35 else -1 if away[1] < -0.35 else 0
+    side = "left" if away[0] > 0 else "right"
+    lines = [(names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}", size_pt, colour, "bold")]
+    if height:
+        lines.append((f"z {place[2]:.2f} m", 8.5, style.MUTED, "normal"))
+    if vertical:
+        x, y, side = 0.0, 11.0 * vertical, "center"
+    else:
+        x, y = 14.0 * np.sign(away[0]), 6.0 * (len(lines) - 1)
+    rows = lines[::-1] if vertical > 0 else lines
+    for text, points, ink, weight in rows:
+        axes.annotate(
+            text,
+            (float(place[0]), float(place[1])),
+            xytext=(x, y),
+            textcoords="offset points",
+            ha=side,
+            va={1: "bottom", 0: "center", -1: "top"}[vertical],
+            fontsize=points,
+            fontweight=weight,
+            color=ink,
+            path_effects=style.HALO,
+            zorder=7,
+        )
+        y += (points + 3.5) * (1 if vertical > 0 else -1)
+
+
+def _clusters(nodes: Mapping[str, Floats], reach_m: float) -> list[tuple[list[str], Floats]]:
+    clusters: list[tuple[list[str], Floats]] = []
+    for name, place in nodes.items():
+        for names, first in clusters:
+            if np.linalg.norm(place[:2] - first[:2]) < reach_m:
+                names.append(name)
+                break
+        else:
+            clusters.append(([name], place))
+    return clusters

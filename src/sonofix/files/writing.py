@@ -1,0 +1,280 @@
+"""What a run writes: ranges, fixes, track, events and TUM trajectories, row by row while it goes on."""
+
+from __future__ import annotations
+
+import csv
+import heapq
+import math
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.files.problem import Problem, RecordingError
+from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step
+from sonofix.site import Site
+
+COLUMNS = {
+    "ranges.csv": "time_s,from,to,range_m,sd_m,range_rate_mps,range_rate_sd_mps,snr_db,clock_offset_m,used",
+    "fixes.csv": "time_s,vehicle,status,x_m,y_m,z_m,yaw_rad,clock_offset_m,cxx_m2,cxy_m2,cyy_m2,czz_m2,"
+    "hdop,vdop,hpl_m,vpl_m,heard,used,excluded",
+    "track.csv": "time_s,vehicle,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,yaw_rad,sd_x_m,sd_y_m,sd_z_m,sd_yaw_rad,source",
+    "events.csv": "time_s,vehicle,event,detail",
+}
+
+
+def write_run(out: str | Path, steps: Iterable[Step], site: Site) -> None:
+    """Write all steps of a run to the folder `out`; each row as soon as its step is there.
+
+    Raises
+    ------
+    RecordingError
+        Where the folder cannot be written to, or is itself a recording.
+    """
+    with RunWriter(out, site) as writer:
+        for step in steps:
+            writer.write(step)
+
+
+class RunWriter:
+    """The files of one run, as a context manager; `write` takes the steps in their order.
+
+    Rows of one file stand in order of time: a row is held back only while a later epoch could still come before it, and
+    leaving the context writes what is held, also after Ctrl-C. Unknown values are empty cells.
+
+    Parameters
+    ----------
+    out : path
+        Folder to write into; made where it does not exist. Earlier outputs there are replaced.
+    site : Site
+        Of the recording: it tells which ranges speak of which vehicle.
+
+    Raises
+    ------
+    RecordingError
+        Where the folder cannot be written to, or is itself a recording; `write` where the disk is full.
+    """
+
+    def __init__(self, out: str | Path, site: Site) -> None:
+        self.out = Path(out)
+        self._site = site
+        self._rides = {
+            "emitter": {beacon.id: beacon.vehicle for beacon in site.beacons},
+            "receiver": {microphone.id: microphone.vehicle for microphone in site.microphones},
+        }
+        self._files: dict[str, _RowFile] = {}
+        self._last_sync_s: float | None = None
+
+    def __enter__(self) -> Self:
+        """Make the folder and its files, with their first lines."""
+        if (self.out / "site.toml").exists():
+            remedy = "is a recording, whose own files would be overwritten; write to another folder with -o"
+            raise RecordingError([Problem(str(self.out), "", None, remedy)])
+        if self.out.exists() and not self.out.is_dir():
+            raise RecordingError([Problem(str(self.out), "", None, "is a file; give a folder with -o")])
+        with told(self.out, ""):
+            self.out.mkdir(parents=True, exist_ok=True)
+        try:
+            for name, header in COLUMNS.items():
+                self._files[name] = _RowFile(self.out / name, header.split(","), ",")
+            for vehicle in self._site.vehicles:
+                self._files[f"tum {vehicle.id}"] = _RowFile(self.out / self._tum_name(vehicle.id), None, " ")
+        except BaseException:
+            self._abandon()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what is held back, and close."""
+        if isinstance(error, RecordingError):
+            self._abandon()
+            return
+        try:
+            for file in self._files.values():
+                file.release(math.inf)
+                file.close()
+        finally:
+            self._abandon()
+
+    def write(self, step: Step) -> None:
+        """Write what one epoch brought.
+
+        Raises
+        ------
+        RecordingError
+            Where it cannot be written, a full disk for example.
+        """
+        sync_s = step.ranges.sync_s
+        self._files["ranges.csv"].add(_range_rows(step))
+        self._files["fixes.csv"].add((fix.time_s, self._fix_row(fix, step.ranges)) for fix in step.fixes)
+        self._files["track.csv"].add((estimate.time_s, _track_row(estimate)) for estimate in step.estimates)
+        self._files["events.csv"].add((event.time_s, _event_row(event)) for event in step.events)
+        for estimate in step.estimates:
+            key = f"tum {estimate.vehicle}"
+            if key not in self._files:
+                self._files[key] = _RowFile(self.out / self._tum_name(estimate.vehicle), None, " ")
+            self._files[key].add([(estimate.time_s, _tum_row(estimate))])
+        # Sound that is heard after the next epoch began may come after that epoch's first rows.
+        final_s = -math.inf if self._last_sync_s is None else 2 * sync_s - self._last_sync_s
+        self._last_sync_s = sync_s
+        for file in self._files.values():
+            file.release(final_s)
+
+    def _tum_name(self, vehicle: str) -> str:
+        safe = re.sub(r"[^\w.-]", "_", vehicle)
+        return "track.tum" if len(self._site.vehicles) < 2 else f"track-{safe}.tum"
+
+    def _fix_row(self, fix: Fix, ranges: RangeEpoch) -> list[str]:
+        heard = self._concerns(fix.vehicle, ranges)
+        used = int(np.count_nonzero(fix.used))
+        excluded = int(np.count_nonzero(heard)) - used if fix.position_m is not None else 0
+        position = fix.position_m if fix.position_m is not None else (None, None, None)
+        return [
+            _time(fix.time_s),
+            fix.vehicle,
+            fix.status,
+            *(_length(value) for value in position),
+            _angle(fix.yaw_rad),
+            _length(fix.clock_offset_m),
+            *(_figure(_covariance(fix, a, b)) for a, b in ("xx", "xy", "yy", "zz")),
+            *(_figure(value) for value in (fix.hdop, fix.vdop, fix.hpl_m, fix.vpl_m)),
+            *map(str, (int(np.count_nonzero(heard)), used, excluded)),
+        ]
+
+    def _concerns(self, vehicle: str, ranges: RangeEpoch) -> NDArray[np.bool_]:
+        """Say of each row whether one of its ends rides on the vehicle."""
+        ends = zip(ranges.emitter, ranges.receiver, strict=True)
+        rides = self._rides["emitter"], self._rides["receiver"]
+        return np.array([vehicle in (rides[0].get(a), rides[1].get(b)) for a, b in ends], dtype=bool)
+
+    def _abandon(self) -> None:
+        for file in self._files.values():
+            file.abandon()
+
+
+class _RowFile:
+    """A text file of rows in order of time; every released row is on its way to the disk when `release` returns."""
+
+    def __init__(self, path: Path, header: list[str] | None, separator: str) -> None:
+        self._path = path
+        self._held: list[tuple[float, int, list[str]]] = []
+        self._count = 0
+        with told(path.parent, path.name):
+            self._file: TextIO = path.open("w", newline="", encoding="utf-8")
+            self._rows = csv.writer(self._file, delimiter=separator, lineterminator="\n")
+            if header:
+                self._rows.writerow(header)
+                self._file.flush()
+
+    def add(self, rows: Iterable[tuple[float, list[str]]]) -> None:
+        """Take rows with their times; equal times keep the order they came in."""
+        for time_s, row in rows:
+            heapq.heappush(self._held, (time_s, self._count, row))
+            self._count += 1
+
+    def release(self, before_s: float) -> None:
+        """Write the rows that stand before a time."""
+        with told(self._path.parent, self._path.name):
+            wrote = False
+            while self._held and self._held[0][0] < before_s:
+                self._rows.writerow(heapq.heappop(self._held)[2])
+                wrote = True
+            if wrote:
+                self._file.flush()
+
+    def close(self) -> None:
+        """Close the file; a disk that is full shows here at the latest."""
+        with told(self._path.parent, self._path.name):
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file whatever may come of it."""
+        with suppress(OSError):
+            self._file.close()
+
+
+@contextmanager
+def told(folder: Path, name: str) -> Iterator[None]:
+    """Turn an error of the operating system into one line for the user."""
+    try:
+        yield
+    except OSError as error:
+        where = str(folder / name) if name else str(folder)
+        remedy = f"cannot be written: {error.strerror or error}; make room or choose another folder with -o"
+        raise RecordingError([Problem(where, "", None, remedy)]) from None
+
+
+def _range_rows(step: Step) -> Iterator[tuple[float, list[str]]]:
+    ranges = step.ranges
+    sd_m = np.sqrt(np.diag(ranges.covariance_m2)) if len(ranges) else np.zeros(0)
+    for i in range(len(ranges)):
+        rates = (ranges.range_rate_mps, ranges.range_rate_sd_mps, ranges.snr_db)
+        yield (
+            float(ranges.time_s[i]),
+            [
+                _time(ranges.time_s[i]),
+                ranges.emitter[i],
+                ranges.receiver[i],
+                _length(ranges.range_m[i]),
+                _figure(sd_m[i]),
+                *(_figure(None if values is None else values[i]) for values in rates),
+                _length(step.range_clock_offset_m[i]),
+                str(int(step.range_used[i])),
+            ],
+        )
+
+
+def _track_row(estimate: Estimate) -> list[str]:
+    return [
+        _time(estimate.time_s),
+        estimate.vehicle,
+        *(_length(value) for value in estimate.position_m),
+        *(_length(value) for value in estimate.velocity_mps),
+        _angle(estimate.yaw_rad),
+        *(_figure(estimate.sd(state)) for state in ("x", "y", "z", "yaw")),
+        estimate.source,
+    ]
+
+
+def _tum_row(estimate: Estimate) -> list[str]:
+    """Return `timestamp tx ty tz qx qy qz qw`; a heading that is not known is written as none turned."""
+    half = 0.5 * (estimate.yaw_rad or 0.0)
+    place = [format(float(value), ".6f") for value in estimate.position_m]
+    return [_time(estimate.time_s), *place, "0", "0", format(math.sin(half), ".9f"), format(math.cos(half), ".9f")]
+
+
+def _event_row(event: Event) -> list[str]:
+    return [_time(event.time_s), event.vehicle, event.event, " ".join(event.detail.split())]
+
+
+def _covariance(fix: Fix, a: str, b: str) -> float | None:
+    if fix.covariance is None or a not in fix.states or b not in fix.states:
+        return None
+    return float(fix.covariance[fix.states.index(a), fix.states.index(b)])
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "" if value is None or not math.isfinite(value) else format(float(value), form)
+
+
+def _time(value: float) -> str:
+    return _cell(value, ".9f")
+
+
+def _length(value: float | None) -> str:
+    return _cell(value, ".6f")
+
+
+def _angle(value: float | None) -> str:
+    return _cell(value, ".6f")
+
+
+def _figure(value: float | None) -> str:
+    return _cell(value, ".6g")

@@ -1,0 +1,311 @@
+"""The whole street on one screen: samples or stated ranges in, a `Step` an epoch out.
+
+File, live and simulation run this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix import air
+from sonofix.acquire.epochs import Schedule, Window, reach_s, screen
+from sonofix.acquire.plan import acquire, make_plan
+from sonofix.locate.fix import fix
+from sonofix.ranging import range_epoch, stated_epochs
+from sonofix.records import (
+    Acquisition,
+    Detection,
+    Estimate,
+    Event,
+    Floats,
+    Prediction,
+    RangeEpoch,
+    Recording,
+    Step,
+    Table,
+    Waveform,
+)
+from sonofix.site import Site
+from sonofix.track.belief import Belief, Motion, estimate, predict
+from sonofix.track.follow import Follower, expectations
+
+DEFAULT_MAX_SPEED_MPS = 3.0
+"""Of a vehicle whose site file states none."""
+
+THERMOMETER_SD_K = 1.0
+"""What a computed sound speed rests on; a stated `sound_speed_mps` is taken as it is."""
+
+
+def sound_speed(site: Site) -> tuple[float, float]:
+    """Sound speed and its deviation, m/s: as stated, or Cramer 1993 from the site's air."""
+    if site.air.sound_speed_mps is not None:
+        return site.air.sound_speed_mps, 0.0
+    a = site.air
+    speed = float(air.sound_speed_mps(a.temperature_c, a.humidity, a.pressure_kpa))
+    return speed, 0.607 * THERMOMETER_SD_K
+
+
+def run(
+    recording: Recording, waveforms: Mapping[str, Waveform] | None = None, rate_hz: float | None = None
+) -> Iterator[Step]:
+    """Run a recording through the whole street.
+
+    Parameters
+    ----------
+    recording : Recording
+    waveforms : mapping from beacon id to Waveform
+        What the coded beacons send; not needed where the recording states ranges.
+    rate_hz : float or None
+        Estimates at this rate; None: one an epoch.
+
+    Yields
+    ------
+    Step, one an epoch, in time order
+
+    Raises
+    ------
+    ValueError
+        If the recording holds neither samples nor ranges, or cannot be sampled at the site's carrier.
+    """
+    if recording.blocks is not None and recording.rate_hz is not None:
+        receiver = Receiver(
+            recording.site, recording.rate_hz, waveforms or {}, recording.sync_s, recording.tables.get("start"), rate_hz
+        )
+        for block in recording.blocks(int(recording.rate_hz)):
+            yield from receiver.feed(block)
+        yield from receiver.finish()
+    elif recording.ranges is not None:
+        street = Street(recording.site, recording.tables.get("start"), rate_hz)
+        for epoch in stated_epochs(recording.ranges, sound_speed(recording.site)[0]):
+            yield street.walk(epoch)
+    else:
+        raise ValueError("the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv")
+
+
+class Street:
+    """From ranges to estimates: what file, live and stated ranges share."""
+
+    def __init__(self, site: Site, start: Table | None = None, rate_hz: float | None = None) -> None:
+        self.site = site
+        self.rate_hz = rate_hz
+        emitters = {b.vehicle for b in site.coded_beacons}
+        free_running = site.schedule is not None and not site.schedule.synchronised and None not in emitters
+        self.follower = Follower(site, Motion(), free_running)
+        self._start = start
+        self._written_s: float | None = None
+
+    def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
+        """Take in the ranges of one epoch."""
+        if self._start is not None:
+            self._place(self._start, epoch.sync_s)
+        fixes = tuple(fix(epoch, self.site, v.id) for v in self.site.vehicles)
+        before = self.follower.belief
+        estimates, used, events = self.follower.step(epoch, fixes)
+        believed = used.copy()
+        offset = np.full(len(epoch), 0.0 if epoch.clock == "known" else np.nan)
+        if epoch.clock == "common" and estimates and estimates[0].clock_offset_m is not None:
+            offset[:] = estimates[0].clock_offset_m
+        for found in fixes:
+            if found.status == "ok":
+                asked = np.isfinite(found.residual_m)
+                believed[asked] = found.used[asked]
+                if found.clock_offset_m is not None:
+                    offset[asked] = found.clock_offset_m
+        if self.rate_hz is not None:
+            estimates = self._between(before, estimates)
+        return Step(epoch, fixes, estimates, flags + events, believed & np.isfinite(offset), offset)
+
+    def _place(self, start: Table, time_s: float) -> None:
+        """Put vehicles where start.csv says, once."""
+        self._start = None
+        vehicles = start.names.get("vehicle") or (self.site.vehicles[0].id,) * len(start.columns["x_m"])
+        for i, vehicle in enumerate(vehicles):
+            z = start.columns.get("z_m")
+            level = self.site.vehicle(vehicle).z_m
+            height = level if level is not None else (0.0 if z is None or np.isnan(z[i]) else float(z[i]))
+            position = np.array([start.columns["x_m"][i], start.columns["y_m"][i], height])
+            self.follower.start(vehicle, time_s, position, float(start.columns["yaw_rad"][i]))
+
+    def _between(self, before: Belief, latest: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
+        """Return estimates on the grid of the wished rate up to the latest instant, by what was known at each."""
+        if self.rate_hz is None or not latest:
+            return ()
+        if self._written_s is None:
+            self._written_s = np.ceil(latest[0].time_s * self.rate_hz) / self.rate_hz
+            return ()
+        out: list[Estimate] = []
+        while self._written_s <= latest[0].time_s:
+            aged = predict(before, self._written_s, self.follower.motion)
+            out += [estimate(aged, self.site, int(i), "predicted") for i in np.flatnonzero(aged.placed)]
+            self._written_s += 1.0 / self.rate_hz
+        return tuple(out)
+
+
+class Receiver:
+    """Follows a stream of samples: feed it blocks, it yields a Step for each epoch that they complete.
+
+    Parameters
+    ----------
+    site : Site
+    sample_rate_hz : float
+    waveforms : mapping from beacon id to Waveform
+    sync_s : float64 (epochs,) or None
+        When sync commands arrived; None: every period from sample 0 on.
+    start : Table or None
+        Known start poses.
+    rate_hz : float or None
+        Estimates at this rate; None: one an epoch.
+
+    Raises
+    ------
+    ValueError
+        If the site has no schedule, no coded beacon or no microphone with a channel, or samples come too slowly.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        sample_rate_hz: float,
+        waveforms: Mapping[str, Waveform],
+        sync_s: Floats | None = None,
+        start: Table | None = None,
+        rate_hz: float | None = None,
+    ) -> None:
+        if site.schedule is None or site.schedule.period_s is None:
+            raise ValueError("reading samples needs [schedule] period_s: state how often the beacons burst")
+        self.site = site
+        self.waveforms = waveforms
+        self.sound_speed_mps, self.sound_speed_sd_mps = sound_speed(site)
+        self._microphones = [m for m in site.microphones if m.channel is not None]
+        if not self._microphones:
+            raise ValueError("no [[microphone]] names a channel of the capture: add channel = 0, 1, …")
+        speeds = [v.max_speed_mps or DEFAULT_MAX_SPEED_MPS for v in site.vehicles] or [0.0]
+        sounding = any(b.vehicle for b in site.coded_beacons) and any(m.vehicle for m in self._microphones)
+        self._plan = make_plan(
+            waveforms, sample_rate_hz, self.sound_speed_mps, max(speeds) * (2.0 if sounding else 1.0)
+        )
+        known = site.schedule.synchronised
+        regular = any(b.vehicle is None for b in site.coded_beacons)
+        self._schedule = Schedule(site.schedule.period_s, reach_s(site, self.sound_speed_mps), sync_s, known, regular)
+        self._street = Street(site, start, rate_hz)
+        self._offsets_s = {b.id: b.offset_s + b.delay_s for b in site.coded_beacons}
+        self._samples = np.zeros((0, 0), np.float32)
+        self._first = 0  # index of _samples[0] in the stream; below 0 for the silence before it
+        self._heard_last = 0
+        self._agility_mps2 = 1.0
+
+    def feed(self, block: NDArray[np.float32]) -> Iterator[Step]:
+        """Take in samples (n, channels), full scale ±1, and yield what they complete."""
+        if not self._samples.size:
+            lead = int(np.ceil(self._plan.margin_s * self._plan.sample_rate_hz))
+            self._samples, self._first = np.zeros((lead, block.shape[1]), np.float32), -lead
+        self._samples = np.concatenate([self._samples, block])
+        yield from self._listen(complete=True)
+
+    def finish(self) -> Iterator[Step]:
+        """Yield what the last samples still hold."""
+        yield from self._listen(complete=False)
+
+    def _listen(self, complete: bool) -> Iterator[Step]:
+        rate = self._plan.sample_rate_hz
+        latest_s = max(self._offsets_s.values())
+        while (window := self._schedule.window()) is not None:
+            end_s = (self._first + len(self._samples)) / rate
+            wanted_s = window.closes_s + latest_s + self._plan.burst_s + self._plan.margin_s
+            if complete and wanted_s > end_s:
+                break
+            if not complete and window.opens_s + min(w.duration_s for w in self.waveforms.values()) > end_s:
+                break
+            begin = max(0, round((window.opens_s - self._plan.margin_s) * rate) - self._first)
+            end = round(wanted_s * rate) - self._first
+            first = self._first + begin
+            heard, flags = self._hear(window, self._samples[begin:end], first)
+            starts_s = np.array(
+                [d.arrival_s - self.waveforms[d.emitter].duration_s / 2 - self._offsets_s[d.emitter] for d in heard]
+            )
+            if window.seeking:
+                self._schedule.found(starts_s)
+                if not heard:
+                    yield self._step(window, heard, flags)
+                continue
+            yield self._step(window, heard, flags)
+            self._schedule.done(starts_s)
+            following = self._schedule.window()
+            if following is not None:
+                drop = round((following.opens_s - self._plan.margin_s) * rate) - self._first
+                drop = min(max(drop, 0), len(self._samples) - 1)
+                self._samples, self._first = self._samples[drop:], self._first + drop
+
+    def _hear(
+        self, window: Window, samples: NDArray[np.float32], first: int
+    ) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
+        """Acquire every microphone's bursts: warm where a track says what to expect, cold where that fails."""
+        flags: list[str] = []
+        heard: list[Detection] = []
+        for microphone in self._microphones:
+            channel, odd = screen(samples[:, microphone.channel])
+            flags += [f"microphone {microphone.id}: {text}" for text in odd]
+            windows = {
+                emitter: (window.opens_s + offset + microphone.delay_s, window.closes_s + offset + microphone.delay_s)
+                for emitter, offset in self._offsets_s.items()
+                if self.site.beacon(emitter).vehicle is None or self.site.beacon(emitter).vehicle != microphone.vehicle
+            }
+            expected = {} if window.seeking else self._expect(window, microphone.id, list(windows))
+            found = acquire(self._plan, channel, first, microphone.id, windows, expected)
+            if expected and len(found) < 0.7 * self._heard_last / len(self._microphones):
+                found = acquire(self._plan, channel, first, microphone.id, windows)
+            heard += found
+        self._heard_last = len(heard)
+        return tuple(heard), tuple(flags)
+
+    def _step(self, window: Window, heard: tuple[Detection, ...], flags: tuple[str, ...]) -> Step:
+        acquired = Acquisition(window.index, window.sync_s, heard, flags)
+        ranges = range_epoch(self.site, self.waveforms, acquired, self.sound_speed_mps, self.sound_speed_sd_mps)
+        events = tuple(Event(window.sync_s, "", "samples", text) for text in flags)
+        before = self._street.follower.belief
+        step = self._street.walk(ranges, events)
+        self._watch(before, self._street.follower.belief)
+        return step
+
+    def _watch(self, before: Belief, after: Belief) -> None:
+        """Learn how briskly vehicles change speed: what the next warm search must allow for."""
+        dt = after.time_s - before.time_s
+        if dt > 0 and before.placed.any():
+            change = float(np.max(np.abs(after.pose()[:, 4:7] - before.pose()[:, 4:7]))) / dt
+            self._agility_mps2 = max(change, 0.7 * self._agility_mps2)
+
+    def _expect(self, window: Window, receiver: str, emitters: list[str]) -> dict[str, Prediction]:
+        """Say where bursts should be, from the track; nothing where no vehicle of the pair has a position."""
+        belief = self._street.follower.belief
+        if not belief.placed.all() or not self._heard_last or not emitters:
+            return {}
+        microphone = self.site.microphone(receiver)
+        middle_s = {e: self._offsets_s[e] + self.waveforms[e].duration_s / 2 for e in emitters}
+        aged = predict(belief, window.sync_s + float(np.mean(list(middle_s.values()))) + 0.03, self._motion(window))
+        range_m, range_sd, rate, rate_sd = expectations(
+            aged, self.site, [(e, receiver) for e in emitters], self.sound_speed_mps
+        )
+        c = self.sound_speed_mps
+        common = self.site.schedule is not None and not self.site.schedule.synchronised
+        offset_m = float(belief.mean[-2]) if common else 0.0
+        # a free-running source keeps no time from burst to burst, only its speed carries over
+        loose_s = 1.0 if self._street.follower.free_running else (1e-3 if common else 2e-4)
+        return {
+            e: Prediction(
+                emitter=e,
+                receiver=receiver,
+                arrival_s=window.sync_s + middle_s[e] + microphone.delay_s + (range_m[i] + offset_m) / c,
+                arrival_sd_s=float(np.hypot(range_sd[i] / c, loose_s)),
+                range_rate_mps=float(rate[i]),
+                range_rate_sd_mps=float(np.hypot(rate_sd[i], 0.05)),
+            )
+            for i, e in enumerate(emitters)
+        }
+
+    def _motion(self, window: Window) -> Motion:
+        dt = max(window.sync_s - self._street.follower.belief.time_s, 0.1)
+        return replace(self._street.follower.motion, acceleration_psd=max(0.01, self._agility_mps2**2 * dt))

@@ -1,0 +1,26 @@
+"""What rows are uncertain by beyond their own measurement: beacon places, and motion within the epoch."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.geometry import Links
+from sonofix.records import Floats, RangeEpoch
+
+MANOEUVRE_MPS2 = 1.0
+"""Acceleration (one sigma) within an epoch: rows heard some milliseconds apart see another velocity."""
+
+
+def row_noise(epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats) -> tuple[Floats, Floats | None]:
+    """Covariance of ranges (n, n) in m² and variances of range rates (n,) in m²/s², where there are any.
+
+    ``dt`` (n,) is when each row was heard from the instant the motion state belongs to.
+    """
+    covariance = epoch.covariance_m2[np.ix_(rows, rows)] + np.diag((MANOEUVRE_MPS2 * dt**2 / 2) ** 2)
+    emitters = np.array([epoch.emitter[i] for i in rows])
+    # a beacon's misplacement is the same for all who hear it
+    covariance += np.where(emitters[:, None] == emitters, links.emitter_sd_m[rows] ** 2, 0.0)
+    if epoch.range_rate_sd_mps is None:
+        return covariance, None
+    return covariance, epoch.range_rate_sd_mps[rows] ** 2 + (MANOEUVRE_MPS2 * dt) ** 2

@@ -1,0 +1,1 @@
+"""Planning: what a layout of beacons promises before anything has sounded."""

@@ -1,0 +1,100 @@
+"""Detections → ranges, at the one instant that defines a row.
+
+``time_s`` = t is when the microphone hears the middle of the burst; the range is c times the time since that middle
+was sent. Where the clock is not common to both ends, all ranges of an epoch share one unknown offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sonofix.records import Acquisition, RangeEpoch, RangeRows, Waveform
+from sonofix.site import Site
+
+RANGES_WITHOUT_SD_M = 0.1
+"""Deviation taken for a stated range that states none: what radio ranging of the better kind shows."""
+
+SWEEP_S = 1.0
+"""Stated ranges are gathered into epochs no longer than this."""
+
+
+def range_epoch(
+    site: Site,
+    waveforms: Mapping[str, Waveform],
+    acquired: Acquisition,
+    sound_speed_mps: float,
+    sound_speed_sd_mps: float = 0.0,
+) -> RangeEpoch:
+    """Ranges of what was heard in one epoch, in order of arrival.
+
+    ``covariance_m2`` holds each range's own variance and what all share: the sound speed's error, in proportion.
+    """
+    heard = sorted(acquired.detections, key=lambda d: d.arrival_s)
+    beacons = [site.beacon(d.emitter) for d in heard]
+    delay_s = np.array([site.microphone(d.receiver).delay_s for d in heard])
+    time_s = np.array([d.arrival_s for d in heard]) - delay_s
+    sent_s = acquired.sync_s + np.array([b.offset_s + b.delay_s + waveforms[b.id].duration_s / 2 for b in beacons])
+    range_m = sound_speed_mps * (time_s - sent_s)
+    own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2
+    rate = sound_speed_mps * (1.0 - np.array([d.time_scale for d in heard]))
+    rate_sd = sound_speed_mps * np.sqrt([d.covariance[1, 1] for d in heard])
+    common_clock = site.schedule is not None and not site.schedule.synchronised
+    # with an unknown offset inside, the flight is not known: the spread of ranges is what the speed's error scales
+    flight_m = range_m - range_m.min(initial=np.inf) if common_clock and len(heard) else range_m
+    shared = (sound_speed_sd_mps / sound_speed_mps) ** 2 * np.outer(flight_m, flight_m)
+    return RangeEpoch(
+        index=acquired.index,
+        sync_s=acquired.sync_s,
+        emitter=tuple(d.emitter for d in heard),
+        receiver=tuple(d.receiver for d in heard),
+        time_s=time_s,
+        range_m=range_m,
+        covariance_m2=np.diag(own) + shared,
+        range_rate_mps=rate,
+        range_rate_sd_mps=rate_sd,
+        snr_db=np.array([d.snr_db for d in heard]),
+        clock="common" if common_clock else "known",
+        sound_speed_mps=sound_speed_mps,
+        flags=acquired.flags,
+    )
+
+
+def stated_epochs(rows: RangeRows, sound_speed_mps: float) -> list[RangeEpoch]:
+    """Epochs of ranges that a recording states: one sweep over the pairs each, until a pair comes again."""
+    epochs: list[RangeEpoch] = []
+    order = np.argsort(rows.time_s, kind="stable")
+    sweep: list[int] = []
+    seen: set[tuple[str, str]] = set()
+
+    def close() -> None:
+        at = np.array(sweep)
+        sd = np.full(len(at), np.nan) if rows.sd_m is None else rows.sd_m[at]
+        epochs.append(
+            RangeEpoch(
+                index=len(epochs),
+                sync_s=float(rows.time_s[at[0]]),
+                emitter=tuple(rows.emitter[i] for i in sweep),
+                receiver=tuple(rows.receiver[i] for i in sweep),
+                time_s=rows.time_s[at],
+                range_m=rows.range_m[at],
+                covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2),
+                range_rate_mps=None,
+                range_rate_sd_mps=None,
+                snr_db=None,
+                clock="known",
+                sound_speed_mps=sound_speed_mps,
+            )
+        )
+
+    for i in order:
+        pair = (rows.emitter[i], rows.receiver[i])
+        if sweep and (pair in seen or rows.time_s[i] - rows.time_s[sweep[0]] > SWEEP_S):
+            close()
+            sweep, seen = [], set()
+        sweep.append(int(i))
+        seen.add(pair)
+    if sweep:
+        close()
+    return epochs

@@ -1,0 +1,187 @@
+"""What a filter believes of all vehicles at one instant, and how that ages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.geometry import POSE
+from sonofix.records import Estimate, Fix, Floats, Source
+from sonofix.site import Site
+
+SIZE = len(POSE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """How freely vehicles move: constant velocity, disturbed by white acceleration.
+
+    ``acceleration_psd`` in m²/s³ per axis, ``turn_psd`` in rad²/s³; ``clock_psd`` in m²/s³ of the clock's drift.
+    """
+
+    acceleration_psd: float = 0.5
+    turn_psd: float = 0.3
+    clock_psd: float = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """Joint Gaussian over all vehicles and the recorder's clock.
+
+    Attributes
+    ----------
+    time_s : float
+    mean : float64 (8 V + 2,)
+        Each vehicle's `geometry.POSE`, then clock offset (m) and drift (m/s).
+    covariance : float64 (8 V + 2, 8 V + 2)
+        Zero rows where a component is known or not estimated.
+    free : bool (8 V + 2,)
+        What is estimated.
+    placed : bool (V,)
+        Vehicles that have a position yet.
+    """
+
+    time_s: float
+    mean: Floats
+    covariance: Floats
+    free: NDArray[np.bool_]
+    placed: NDArray[np.bool_]
+
+    def pose(self) -> Floats:
+        """Poses (V, 8)."""
+        return self.mean[:-2].reshape(-1, SIZE)
+
+
+def blank(site: Site) -> Belief:
+    """Return the belief before anything was heard."""
+    n = SIZE * len(site.vehicles) + 2
+    mean = np.zeros(n)
+    for i, vehicle in enumerate(site.vehicles):
+        mean[SIZE * i + 2] = vehicle.z_m or 0.0
+    return Belief(0.0, mean, np.zeros((n, n)), np.zeros(n, bool), np.zeros(len(site.vehicles), bool))
+
+
+def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
+    """Age a belief: positions move with their velocities, uncertainty grows with the white acceleration's integral."""
+    dt = time_s - belief.time_s
+    if dt == 0.0 or not belief.placed.any():
+        return replace(belief, time_s=time_s)
+    n = len(belief.mean)
+    transition = np.eye(n)
+    noise = np.zeros((n, n))
+    age = abs(dt)
+    for i in np.flatnonzero(belief.placed):
+        at = SIZE * int(i)
+        for place, speed, psd in (
+            (at, at + 4, motion.acceleration_psd),
+            (at + 1, at + 5, motion.acceleration_psd),
+            (at + 2, at + 6, motion.acceleration_psd),
+            (at + 3, at + 7, motion.turn_psd),
+        ):
+            _integrate(transition, noise, place, speed, psd, dt, age, belief.free)
+    _integrate(transition, noise, n - 2, n - 1, motion.clock_psd, dt, age, belief.free)
+    return replace(
+        belief,
+        time_s=time_s,
+        mean=transition @ belief.mean,
+        covariance=transition @ belief.covariance @ transition.T + noise,
+    )
+
+
+def _integrate(
+    transition: Floats,
+    noise: Floats,
+    place: int,
+    speed: int,
+    psd: float,
+    dt: float,
+    age: float,
+    free: NDArray[np.bool_],
+) -> None:
+    """Fill the block of one integrated pair; the noise is that of white acceleration (Bar-Shalom 2001, eq 6.2.2-12)."""
+    if not free[speed]:
+        return
+    transition[place, speed] = dt
+    noise[speed, speed] += psd * age
+    if free[place]:
+        noise[place, place] += psd * age**3 / 3
+        noise[place, speed] += psd * dt * age / 2
+        noise[speed, place] += psd * dt * age / 2
+
+
+def place(belief: Belief, vehicle: int, fix: Fix) -> Belief:
+    """Put a vehicle where a fix says, forgetting what was believed of it.
+
+    Velocities that the fix leaves open start at 0 ± 1 m/s.
+    """
+    if fix.position_m is None or fix.covariance is None:
+        raise ValueError(f"a fix of status {fix.status!r} has no position to place vehicle {fix.vehicle} at")
+    at = SIZE * vehicle
+    own = np.arange(at, at + SIZE)
+    names = {name: at + i for i, name in enumerate(POSE)}
+    mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
+    covariance[own, :] = covariance[:, own] = 0.0
+    free[own] = False
+    mean[own] = 0.0
+    mean[at : at + 3] = fix.position_m
+    if fix.velocity_mps is not None:
+        mean[at + 4 : at + 7] = fix.velocity_mps
+    mean[at + 3] = fix.yaw_rad or 0.0
+    if "clock" in fix.states:
+        names["clock"] = len(mean) - 2
+        clock = [len(mean) - 2, len(mean) - 1]
+        covariance[clock, :] = covariance[:, clock] = 0.0
+        mean[clock] = [fix.clock_offset_m or 0.0, 0.0]
+        covariance[-1, -1] = 0.02**2  # 60 ppm of the sound speed
+        free[clock] = True
+    index = [names[state] for state in fix.states]
+    covariance[np.ix_(index, index)] = fix.covariance
+    free[index] = True
+    for i, open_by in ((4, 0), (5, 1), (6, 2), (7, 3)):
+        if free[at + open_by] and not free[at + i]:
+            free[at + i] = True
+            covariance[at + i, at + i] = 1.0
+    placed = belief.placed.copy()
+    placed[vehicle] = True
+    return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
+
+
+def start_at(belief: Belief, vehicle: int, position_m: Floats, yaw_rad: float, level_known: bool) -> Belief:
+    """Put a vehicle at a stated start pose, good to 5 cm; it stands still there as far as is known (0 ± 0.5 m/s)."""
+    at = SIZE * vehicle
+    mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
+    mean[at : at + 3] = position_m
+    mean[at + 3] = yaw_rad
+    for i, sd in ((0, 0.05), (1, 0.05), (2, 0.05), (4, 0.5), (5, 0.5), (6, 0.5)):
+        if level_known and i in (2, 6):
+            continue
+        free[at + i] = True
+        covariance[at + i, at + i] = sd**2
+    placed = belief.placed.copy()
+    placed[vehicle] = True
+    return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
+
+
+def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estimate:
+    """Return what is believed of one vehicle."""
+    at = SIZE * vehicle
+    own = [at + i for i in range(SIZE) if belief.free[at + i] and POSE[i] != "yaw_rate"]
+    names = [POSE[i - at] for i in own]
+    n = len(belief.mean)
+    if belief.free[n - 2]:
+        own.append(n - 2)
+        names.append("clock")
+    pose = belief.mean[at : at + SIZE]
+    return Estimate(
+        time_s=belief.time_s,
+        vehicle=site.vehicles[vehicle].id,
+        states=tuple(names),
+        position_m=pose[:3].copy(),
+        velocity_mps=pose[4:7].copy(),
+        yaw_rad=float(np.angle(np.exp(1j * pose[3]))) if belief.free[at + 3] else None,
+        clock_offset_m=float(belief.mean[n - 2]) if belief.free[n - 2] else None,
+        covariance=belief.covariance[np.ix_(own, own)],
+        source=source,
+    )

@@ -1,0 +1,203 @@
+"""One track a vehicle, from start to end: place it, age it, correct it, and never lock it out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.geometry import Links, link, row_times
+from sonofix.locate.fix import fix
+from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
+from sonofix.site import Site
+from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, start_at
+from sonofix.track.update import update
+
+PATIENCE = 3
+"""Epochs in which most rows are refused before the track is put where the ranges say."""
+
+GATHER_S = 5.0
+"""Where single epochs are too poor for a fix, ranges of this long are gathered for one."""
+
+
+class Follower:
+    """Follows all vehicles of a site through its epochs.
+
+    Parameters
+    ----------
+    site : Site
+    motion : Motion
+    free_running : bool
+        The clock offset is another in every epoch (a sounding vehicle on its own clock).
+    """
+
+    def __init__(self, site: Site, motion: Motion | None = None, free_running: bool = False) -> None:
+        self.site = site
+        self.motion = motion or Motion()
+        self.free_running = free_running
+        self.belief = blank(site)
+        self._refused = np.zeros(len(site.vehicles), int)
+        self._heard = np.zeros(len(site.vehicles), bool)
+        self._recent: list[RangeEpoch] = []
+        self._lag_s = 0.0
+
+    def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
+        """Place a vehicle at a pose known beforehand."""
+        who = [v.id for v in self.site.vehicles].index(vehicle)
+        known = self.site.vehicles[who].z_m is not None
+        self.belief = start_at(replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known)
+
+    def step(
+        self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
+    ) -> tuple[tuple[Estimate, ...], NDArray[np.bool_], tuple[Event, ...]]:
+        """Take in one epoch.
+
+        Returns
+        -------
+        estimates : one a vehicle that has a position
+        used : bool (n,), rows that entered
+        events
+        """
+        links = link(self.site, epoch.emitter, epoch.receiver)
+        time_s = self._time(epoch, links)
+        events: list[Event] = []
+        self.belief = predict(self.belief, max(time_s, self.belief.time_s), self.motion)
+        candidates = np.isfinite(epoch.range_m)
+        for found in fixes:
+            if found.status == "ok":
+                candidates &= found.used | np.isnan(found.residual_m)
+        self._clock(epoch, links, fixes)
+        self._gather(epoch)
+        self._place(links, fixes, events)
+        self.belief, used = update(self.belief, epoch, links, candidates)
+        self._judge(epoch, links, used, fixes, events)
+        return self._estimates(links, used), used, tuple(events)
+
+    def ahead(self, time_s: float) -> tuple[Estimate, ...]:
+        """Return what is expected at a later instant, by all vehicles that have a position."""
+        later = predict(self.belief, time_s, self.motion)
+        return tuple(estimate(later, self.site, int(i), "predicted") for i in np.flatnonzero(later.placed))
+
+    def _time(self, epoch: RangeEpoch, links: Links) -> float:
+        """Instant the epoch's state belongs to; an empty epoch takes the delay that others showed."""
+        if not len(epoch):
+            return epoch.sync_s + self._lag_s
+        moments = epoch.time_s
+        if epoch.clock == "known":
+            moments = row_times(links, epoch.time_s, epoch.range_m, epoch.sound_speed_mps)
+        time_s = float(np.mean(moments))
+        self._lag_s = time_s - epoch.sync_s
+        return time_s
+
+    def _clock(self, epoch: RangeEpoch, links: Links, fixes: tuple[Fix, ...]) -> None:
+        """Forget the clock offset of a free-running source: nothing ties it to the last epoch's."""
+        belief = self.belief
+        if not (self.free_running and len(epoch) and belief.placed.any()):
+            return
+        known = [f.clock_offset_m for f in fixes if f.clock_offset_m is not None]
+        mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
+        mean[-2] = known[0] if known else float(np.median(epoch.range_m))
+        mean[-1] = 0.0
+        covariance[-2:, :] = covariance[:, -2:] = 0.0
+        covariance[-2, -2] = 100.0**2
+        free[-2:] = [True, False]
+        self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
+
+    def _gather(self, epoch: RangeEpoch) -> None:
+        if len(epoch):
+            self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
+
+    def _place(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> None:
+        """Give positions to vehicles that have none, or whose track refuses what is heard."""
+        for who, found in enumerate(fixes):
+            lost = self._refused[who] >= PATIENCE
+            if self.belief.placed[who] and not lost:
+                continue
+            start = found
+            if found.status == "too-few" and np.any(self._touches(links, who)):
+                start = self._gathered(found.vehicle)
+            if start.status not in ("ok", "inconsistent") or start.position_m is None:
+                continue
+            aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
+            self.belief = predict(place(aged, who, start), self.belief.time_s, self.motion)
+            self._refused[who] = 0
+            x, y, z = start.position_m
+            word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
+            events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
+
+    def _gathered(self, vehicle: str) -> Fix:
+        """Return a fix from the latest range of each pair within some seconds."""
+        latest: dict[tuple[str, str], tuple[RangeEpoch, int]] = {}
+        for epoch in self._recent:
+            for i, pair in enumerate(zip(epoch.emitter, epoch.receiver, strict=True)):
+                latest[pair] = (epoch, i)
+        last = self._recent[-1]
+        chosen = list(latest.values())
+        merged = replace(
+            last,
+            emitter=tuple(pair[0] for pair in latest),
+            receiver=tuple(pair[1] for pair in latest),
+            time_s=np.array([e.time_s[i] for e, i in chosen]),
+            range_m=np.array([e.range_m[i] for e, i in chosen]),
+            covariance_m2=np.diag([e.covariance_m2[i, i] for e, i in chosen]),
+            range_rate_mps=None,
+            range_rate_sd_mps=None,
+            snr_db=None,
+        )
+        return fix(merged, self.site, vehicle)
+
+    def _touches(self, links: Links, who: int) -> NDArray[np.bool_]:
+        return (links.emitter_vehicle == who) | (links.receiver_vehicle == who)
+
+    def _judge(
+        self,
+        epoch: RangeEpoch,
+        links: Links,
+        used: NDArray[np.bool_],
+        fixes: tuple[Fix, ...],
+        events: list[Event],
+    ) -> None:
+        """Count refusals; tell when a vehicle falls silent, is heard again, or a range was left out."""
+        for who, vehicle in enumerate(self.site.vehicles):
+            touching = self._touches(links, who)
+            heard = bool(np.any(used & touching))
+            if self.belief.placed[who]:
+                if np.any(touching) and np.sum(used & touching) < 0.5 * np.sum(touching):
+                    self._refused[who] += 1
+                else:
+                    self._refused[who] = 0
+                if self._heard[who] and not heard:
+                    events.append(Event(self.belief.time_s, vehicle.id, "lost", "no range believed in this epoch"))
+                elif heard and not self._heard[who]:
+                    events.append(Event(self.belief.time_s, vehicle.id, "found", f"{np.sum(used & touching)} ranges"))
+                self._heard[who] = heard
+        for found in fixes:
+            if found.status == "ok":
+                for i in np.flatnonzero(~found.used & np.isfinite(found.residual_m)):
+                    text = f"{epoch.emitter[i]} to {epoch.receiver[i]}: {100 * found.residual_m[i]:+.1f} cm off"
+                    events.append(Event(float(epoch.time_s[i]), found.vehicle, "excluded", text))
+
+    def _estimates(self, links: Links, used: NDArray[np.bool_]) -> tuple[Estimate, ...]:
+        out = []
+        for who in np.flatnonzero(self.belief.placed):
+            entered = bool(np.any(used & self._touches(links, int(who))))
+            out.append(estimate(self.belief, self.site, int(who), "fused" if entered else "predicted"))
+        return tuple(out)
+
+
+def expectations(
+    belief: Belief, site: Site, pairs: list[tuple[str, str]], sound_speed_mps: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Range, its deviation, range rate and its deviation that a belief expects of emitter–receiver pairs, each (n,)."""
+    from sonofix.geometry import model
+
+    links = link(site, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs))
+    range_m, rate, by_range, by_rate = model(links, belief.pose(), np.zeros(len(pairs)), sound_speed_mps)
+    own = belief.covariance[:-2, :-2]
+
+    def deviation(derivative: Floats) -> Floats:
+        flat = derivative.reshape(len(pairs), -1)
+        return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", flat, own, flat), 0.0))
+
+    return range_m, np.hypot(deviation(by_range), links.emitter_sd_m), rate, deviation(by_rate)
