@@ -1,4 +1,4 @@
-"""A hundred broken inputs: each is answered in clear lines and exit code 2, or runs and is flagged; never a traceback."""
+"""A hundred broken inputs: each is answered in clear lines and exit code 2, or is flagged; never a traceback."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def edit(old: str, new: str, count: int = 1) -> Callable[[Path], None]:
 
 def add(text: str) -> Callable[[Path], None]:
     """Append to the site file."""
-    return lambda folder: (folder / "site.toml").open("a").write("\n" + text + "\n") and None
+    return lambda folder: (folder / "site.toml").write_text(f"{(folder / 'site.toml').read_text()}\n{text}\n") and None
 
 
 def put(name: str, content: str | bytes) -> Callable[[Path], None]:
@@ -56,7 +56,9 @@ def ranges(text: str) -> Callable[[Path], None]:
     return both(without_capture, put("ranges.csv", text))
 
 
-def samples(change: Callable[[np.ndarray], np.ndarray], subtype: str = "PCM_16", rate: int = RATE_HZ, name="capture.wav"):
+def samples(
+    change: Callable[[np.ndarray], np.ndarray], subtype: str = "PCM_16", rate: int = RATE_HZ, name="capture.wav"
+):
     """Change the samples themselves."""
 
     def apply(folder: Path) -> None:
@@ -134,7 +136,7 @@ def directory(name: str) -> Callable[[Path], None]:
 
 def reference(change: Callable[[Path], None]) -> Callable[[Path], None]:
     """Let B1's code be a recorded burst, and break that."""
-    named = edit('{ family = "m-sequence", degree = 5, taps = [2] }', '{ reference = "burst.wav" }')
+    named = edit('{ family = "m-sequence", degree = 6, taps = [1] }', '{ reference = "burst.wav" }')
     return both(named, lambda folder: change(folder / "burst.wav"))
 
 
@@ -144,7 +146,7 @@ def sound(values: np.ndarray, rate: int = RATE_HZ, subtype: str = "PCM_16") -> C
 
 def m(code: str) -> Callable[[Path], None]:
     """Give B1 another code."""
-    return edit('{ family = "m-sequence", degree = 5, taps = [2] }', code)
+    return edit('{ family = "m-sequence", degree = 6, taps = [1] }', code)
 
 
 def several_vehicles(then: Callable[[Path], None]) -> Callable[[Path], None]:
@@ -184,7 +186,7 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("unknown key in [[vehicle]]", edit("z_m = 0.0", "zm = 0.0"), ('vehicle 1 "agv" zm', "did you mean z_m")),
     ("unknown key in [[microphone]]", edit("channel = 0", "chanel = 0"), ("did you mean channel",)),
     ("unknown key in [[beacon]]", edit('id = "B2"', 'id = "B2"\npos = 3'), ('beacon 2 "B2" pos', "unknown key")),
-    ("unknown key in code", edit("taps = [3]", "taps = [3], tabs = [3]"), ("code.tabs", "did you mean taps")),
+    ("unknown key in code", edit("taps = [5]", "taps = [5], tabs = [3]"), ("code.tabs", "did you mean taps")),
     ("key in the wrong section", edit('id = "B2"', 'id = "B2"\nperiod_s = 1'), ("it belongs in [schedule]",)),
     ("name at the top", edit("format = 1", 'format = 1\nname = "x"'), ("name", "it belongs in [site]")),
     ("plural section", edit("[[vehicle]]", "[[vehicles]]"), ("vehicles", "did you mean vehicle")),
@@ -205,7 +207,7 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("sound speed zero", edit("sound_speed_mps = 343.2", "sound_speed_mps = 0"), ("sound_speed_mps",)),
     ("carrier zero", edit("carrier_hz = 12000.0", "carrier_hz = 0"), ("carrier_hz = 0",)),
     ("modulation unknown", edit('modulation = "ask"', 'modulation = "fsk"'), ("'ask' or 'bpsk'",)),
-    ("bandwidth negative", edit("bandwidth_hz = 4000.0", "bandwidth_hz = -1"), ("bandwidth_hz",)),
+    ("bandwidth negative", edit("cycles_per_chip = 6", "cycles_per_chip = 6\nbandwidth_hz = -1"), ("bandwidth_hz",)),
     ("chips without length", edit("cycles_per_chip = 6", ""), ("signal.cycles_per_chip", "length")),
     ("bounds upside down", edit("[-0.1, -0.1, 0.0]", "[-0.1, -0.1, 9.0]"), ("bounds_m", "z must be below")),
     ("bounds of one corner", edit(", [4.1, 3.1, 2.6]]", "]"), ("bounds_m", "two corners")),
@@ -220,9 +222,19 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("latitude 100", add("[origin]\nlatitude_deg = 100.0\nlongitude_deg = 0.0"), ("origin.latitude_deg",)),
     ("origin without longitude", add("[origin]\nlatitude_deg = 10.0"), ("origin.longitude_deg", "is missing")),
     # what must fit together
-    ("no beacon", lambda f: put("site.toml", (f / "site.toml").read_text().split("[[beacon]]")[0])(f), ("nothing sends",)),
-    ("no microphone", lambda f: edit((f / "site.toml").read_text().split("[[microphone]]")[1].split("[[")[0], "")(f)
-        or edit("[[microphone]]", "")(f), ("nothing listens",)),
+    (
+        "no beacon",
+        lambda f: put("site.toml", (f / "site.toml").read_text().split("[[beacon]]")[0])(f),
+        ("nothing sends",),
+    ),
+    (
+        "no microphone",
+        lambda f: (
+            edit((f / "site.toml").read_text().split("[[microphone]]")[1].split("[[")[0], "")(f)
+            or edit("[[microphone]]", "")(f)
+        ),
+        ("nothing listens",),
+    ),
     ("duplicate beacon id", edit('id = "B2"', 'id = "B1"'), ("beacon 2", "beacon 1 has it already")),
     ("duplicate vehicle id", add('[[vehicle]]\nid = "agv"'), ("vehicle 2", "has it already")),
     ("duplicate microphone id", add('[[microphone]]\nid = "M1"\nvehicle = "agv"'), ("microphone 2", "has it already")),
@@ -246,13 +258,21 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("tap outside", m('{ family = "m-sequence", degree = 5, taps = [5] }'), ("code.taps", "from 1 to 4")),
     ("taps empty", m('{ family = "m-sequence", degree = 5, taps = [] }'), ("code.taps",)),
     ("taps not primitive", m('{ family = "m-sequence", degree = 5, taps = [1] }'), ("beacon 1", "taps")),
-    ("duplicate code", edit("taps = [3]", "taps = [2]"), ("same code",)),
-    ("same chips, described twice", m('{ chips = "1111100110100100001010111011000" }'), ("same", "own code")),
+    ("duplicate code", edit("taps = [5]", "taps = [1]"), ("same code",)),
+    (
+        "same chips, described twice",
+        m('{ chips = "111111010101100110111011010010011100010111100101000110000100000" }'),
+        ("same", "own code"),
+    ),
     ("Gold of degree 8", m('{ family = "gold", degree = 8, index = 0 }'), ("no preferred pair",)),
     ("Gold index", m('{ family = "gold", degree = 5, index = 33 }'), ("sequences 0 to 32",)),
     ("Kasami of odd degree", m('{ family = "kasami", degree = 5, index = 0 }'), ("even degree",)),
     ("Kasami index", m('{ family = "kasami", degree = 6, index = 8 }'), ("sequences 0 to 7",)),
-    ("chirp that stands", m('{ family = "chirp", start_hz = 9e3, stop_hz = 9e3, duration_s = 0.01 }'), ("two different",)),
+    (
+        "chirp that stands",
+        m('{ family = "chirp", start_hz = 9e3, stop_hz = 9e3, duration_s = 0.01 }'),
+        ("two different",),
+    ),
     ("chirp too high", m('{ family = "chirp", start_hz = 9e3, stop_hz = 3e4, duration_s = 0.01 }'), ("sample rate",)),
     ("chips with a 2", m('{ chips = "0120" }'), ("must hold 0 and 1 only",)),
     ("chips all alike", m('{ chips = "1111" }'), ("alike",)),
@@ -283,8 +303,14 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("channel negative", edit("channel = 0", "channel = -1"), ("channel = -1",)),
     ("channel not given", edit("channel = 0\n", ""), ("channel", "is missing")),
     ("rate too low", samples(lambda x: x[::2], rate=24000), ("sample rate = 24000", "too slow")),
-    ("no beacon has a code", lambda f: put("site.toml", "\n".join(
-        line for line in (f / "site.toml").read_text().splitlines() if not line.startswith("code")))(f), ("has a code",)),
+    (
+        "no beacon has a code",
+        lambda f: put(
+            "site.toml",
+            "\n".join(line for line in (f / "site.toml").read_text().splitlines() if not line.startswith("code")),
+        )(f),
+        ("has a code",),
+    ),
     # sync.csv
     ("sync empty", put("sync.csv", ""), ("sync.csv", "is empty")),
     ("sync of no rows", put("sync.csv", "time_s\n"), ("sync.csv", "has no rows")),
@@ -302,7 +328,7 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("ranges and times of flight", ranges("time_s,from,to,range_m,time_of_flight_s\n0,B1,M1,1,1\n"), ("exactly one",)),
     ("neither range nor time of flight", ranges("time_s,from,to\n0,B1,M1\n"), ("exactly one",)),
     ("ranges with semicolons", ranges(ROWS.replace(",", ";")), ("separated by commas",)),
-    ("ranges with decimal commas", ranges(ROWS.replace("3.0", "3,0")), ("6", "cells")),
+    ("ranges with decimal commas", ranges(ROWS.replace("3.0", "3,0")), ("5 cells",)),
     ("range as text", ranges(ROWS.replace("2.6", "far")), ("line 3, range_m", '"far"', "number")),
     ("range with a unit", ranges(ROWS.replace("2.6", "2.6 m")), ("line 3, range_m",)),
     ("range with an underscore", ranges(ROWS.replace("2.6", "2_6")), ("line 3, range_m",)),
@@ -311,22 +337,29 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("range left empty", ranges(ROWS.replace("2.6", "")), ("line 3, range_m", "empty")),
     ("sd zero", ranges("time_s,from,to,range_m,sd_m\n0,B1,M1,1,0\n"), ("sd_m", "at least")),
     ("range from nobody", ranges(ROWS.replace("B2", "B9")), ("no [[beacon]]",)),
-    ("range to nobody", ranges(ROWS.replace("M1", "M9")), ("no [[microphone]]", "did you mean" )),
+    ("range to nobody", ranges(ROWS.replace("M1", "M9")), ("no [[microphone]]", "known are M1")),
     ("range backwards in time", ranges(ROWS + "-1.0,B1,M1,3.0\n"), ("line 5, time_s", "backwards")),
     ("ranges cut off", ranges(ROWS + "0.5,B1"), ("line 5", "2 cells")),
     ("ranges with an open quote", ranges(ROWS + '0.5,"B1,M1,3.0\n'), ("not CSV",)),
     ("ranges is binary", ranges(bytes(range(128, 256)).decode("latin-1")), ("ranges.csv",)),
-    ("a robot hears itself", both(add('[[beacon]]\nid = "own"\nvehicle = "agv"'), ranges(ROWS.replace("B2", "own"))),
-     ("does not hear itself",)),
+    (
+        "a robot hears itself",
+        both(add('[[beacon]]\nid = "own"\nvehicle = "agv"'), ranges(ROWS.replace("B2", "own"))),
+        ("does not hear itself",),
+    ),
     # sensor files and truth
     ("odometry text", put("odometry.csv", ODOMETRY + "0,fast,0\n"), ("odometry.csv", "line 2, v_mps")),
     ("odometry backwards", put("odometry.csv", ODOMETRY + "1,0,0\n0.5,0,0\n"), ("odometry.csv", "backwards")),
     ("odometry of no vehicle", several_vehicles(put("odometry.csv", ODOMETRY + "0,1,0\n")), ("several vehicles",)),
-    ("odometry of another vehicle", put("odometry.csv", "time_s,vehicle,v_mps,yaw_rate_radps\n0,avg,1,0\n"), ("did you",)),
+    (
+        "odometry of another vehicle",
+        put("odometry.csv", "time_s,vehicle,v_mps,yaw_rate_radps\n0,avg,1,0\n"),
+        ("did you",),
+    ),
     ("steps negative", put("steps.csv", "time_s,length_m,heading_rad\n0,-1,0\n"), ("steps.csv", "at least 0")),
     ("compass without heading", put("compass.csv", "time_s\n0\n"), ("column heading_rad is missing",)),
     ("imu short", put("imu.csv", "time_s,gx_radps\n0,0\n"), ("column gy_radps is missing",)),
-    ("temperature in kelvin", put("temperature.csv", "time_s,temperature_c\n0,293\n"), ("from -40 to 60",)),
+    ("thermometer in kelvin", put("temperature.csv", "time_s,temperature_c\n0,293\n"), ("from -40 to 60",)),
     ("two starts", put("start.csv", "x_m,y_m,yaw_rad\n0,0,0\n1,1,0\n"), ("start.csv", "two start poses")),
     ("start without yaw", put("start.csv", "x_m,y_m\n0,0\n"), ("column yaw_rad is missing",)),
     ("bearing from nobody", put("bearings.csv", "time_s,from,to,bearing_rad\n0,X,M1,0\n"), ("bearings.csv",)),
@@ -337,9 +370,9 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
 
 # ---- what runs, and must be flagged: name, how it is broken, what `check` says of it ---------------------------------
 FLAGGED: list[tuple[str, Callable[[Path], None], str]] = [
-    ("NaN samples", samples(mutate(slice(2000, 2100), np.nan), "FLOAT"), "100 samples are NaN"),
-    ("one NaN", samples(mutate(9000, np.nan), "FLOAT"), "1 samples are NaN"),
-    ("infinite samples", samples(mutate(slice(6000, 6010), np.inf), "FLOAT"), "10 samples are NaN"),
+    ("NaN samples", samples(mutate(slice(2000, 2100), np.nan), "FLOAT"), "100 samples NaN or infinite"),
+    ("one NaN", samples(mutate(6000, np.nan), "FLOAT"), "1 samples NaN or infinite"),
+    ("infinite samples", samples(mutate(slice(6000, 6010), np.inf), "FLOAT"), "10 samples NaN or infinite"),
     ("all NaN", samples(lambda x: x * np.nan, "FLOAT"), "silent throughout"),
     ("clipped", samples(lambda x: np.clip(40 * x, -1, 1)), "samples are clipped"),
     ("clipped below full scale", samples(lambda x: np.clip(x, -0.02, 0.02)), "samples are clipped"),
@@ -351,29 +384,68 @@ FLAGGED: list[tuple[str, Callable[[Path], None], str]] = [
     ("WAV cut in half", bytes_of(lambda wav: wav[: len(wav) // 2]), "cut off or damaged"),
     ("WAV cut in a sample", bytes_of(lambda wav: wav[: len(wav) // 2 + 1]), "cut off or damaged"),
     ("FLAC cut in half", bytes_of(lambda flac: flac[: len(flac) // 2], flac=True), "cut off or damaged"),
-    ("FLAC damaged", bytes_of(lambda flac: flac[:9000] + b"\x55" * 3000 + flac[12000:], flac=True), "cut off or damaged"),
+    (
+        "FLAC damaged",
+        bytes_of(lambda flac: flac[:9000] + b"\x55" * 3000 + flac[12000:], flac=True),
+        "cut off or damaged",
+    ),
     ("WAV header states too much", bytes_of(data_size(10**6)), "cut off or damaged"),
     ("WAV header states too little", bytes_of(data_size(4000)), "less than one period"),
     ("FLAC header states too much", bytes_of(flac_total(10**6), flac=True), "cut off or damaged"),
     ("FLAC header states too little", bytes_of(flac_total(1000), flac=True), "less than one period"),
-    ("wrong rate in the header", samples(lambda x: x, rate=44100), "Capture: 0.327 s"),
+    ("wrong rate in the header", samples(lambda x: x, rate=44100), "Capture: 0.218 s"),
     ("beacons in one point", in_one_place, "stand in one point"),
     ("beacons on one line", on_one_line, "stand on one line"),
     ("beacon far outside", edit("[4.0, 0.0, 2.4]", "[4000.0, 0.0, 2.4]"), "outside the site's bounds_m"),
     ("beacon at the ear", edit("[4.0, 0.0, 2.4]", "[2.5, 1.0, 0.5]"), "Nothing odd"),
-    ("one beacon", lambda f: put("site.toml", "[[beacon]]".join((f / "site.toml").read_text().split("[[beacon]]")[:2]))(f),
-     "1 fixed beacons cannot give"),
+    (
+        "one beacon",
+        lambda f: put("site.toml", "[[beacon]]".join((f / "site.toml").read_text().split("[[beacon]]")[:2]))(f),
+        "1 fixed beacon cannot give",
+    ),
     ("bursts longer than the period", edit("period_s = 0.1", "period_s = 0.01"), "longer than the period"),
     ("sync beyond the capture", put("sync.csv", "time_s\n0.0\n0.1\n0.2\n99.0\n"), "sync instants lie outside"),
     ("sync all beyond the capture", put("sync.csv", "time_s\n98.0\n99.0\n"), "2 of 2 sync instants lie outside"),
     ("stated sound speed of water", edit("sound_speed_mps = 343.2", "sound_speed_mps = 1480"), "is not that of"),
-    ("chips unlike their family", m('{ family = "m-sequence", degree = 5, taps = [2], chips = "1110010" }'), "are not the"),
+    (
+        "chips unlike their family",
+        m('{ family = "m-sequence", degree = 5, taps = [2], chips = "1110010" }'),
+        "are not the",
+    ),
     ("no truth", lambda f: (f / "truth.csv").unlink(), "no truth.csv"),
     ("misspelt file", put("odometery.csv", "time_s\n"), "did you mean odometry.csv"),
     ("spare channel", samples(lambda x: np.column_stack([x, x])), "names channel 1"),
     ("ranges of a lie", ranges(ROWS.replace("2.6", "26000.0")), "26000.00 m"),
     ("ranges at one instant from one beacon", ranges("time_s,from,to,range_m\n0,B1,M1,3\n"), "1 row of 1 pair"),
 ]
+
+
+# ---- what `run` says of those: exit code, and words in the events, the fixes or the answer ------------------------
+CUT = ("WAV cut in half", "FLAC cut in half", "FLAC damaged", "WAV header states too much")
+RUNS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "NaN samples": (0, ("100 of", "not finite", ",ok,")),
+    "one NaN": (0, ("1 of", "not finite", ",ok,")),
+    "infinite samples": (0, ("10 of", "not finite", ",ok,")),
+    "all NaN": (0, ("not finite", ",too-few,")),
+    "clipped": (0, ("samples are clipped",)),
+    "silent": (0, ("no sound at all", ",too-few,")),
+    "one sample": (2, ("no whole epoch",)),
+    "ten samples": (2, ("no whole epoch",)),
+    "shorter than a burst": (2, ("no whole epoch",)),
+    "FLAC of one sample": (2, ("no whole epoch",)),
+    "FLAC header states too little": (2, ("no whole epoch",)),
+    "sync all beyond the capture": (2, ("no whole epoch",)),
+    "wrong rate in the header": (0, (",too-few,",)),
+    "beacons in one point": (0, (",ambiguous,",)),
+    "beacons on one line": (0, (",ambiguous,",)),
+    "beacon far outside": (0, (",no-convergence,",)),
+    "beacon at the ear": (0, ("excluded",)),
+    "one beacon": (0, (",too-few,",)),
+    "ranges of a lie": (0, (",no-convergence,",)),
+    "ranges at one instant from one beacon": (0, (",too-few,",)),
+    "WAV header states too little": (0, (",ok,",)),
+    **{name: (0, (",ok,",)) for name in CUT},
+}
 
 
 def names(cases: list) -> list[str]:
@@ -409,9 +481,11 @@ def test_the_unbroken_recording_is_right(lab):
 
 
 @pytest.mark.parametrize(("_name", "break_it", "words"), REFUSED, ids=names(REFUSED))
-def test_check_refuses(lab, _name, break_it, words):
+def test_is_refused(lab, _name, break_it, words):
     break_it(lab)
     assert_refused(invoke("check", str(lab)), words)
+    assert_refused(invoke("run", str(lab), "--no-plot"), words)
+    assert not (lab / "out").exists()
 
 
 @pytest.mark.parametrize(("_name", "break_it", "odd"), FLAGGED, ids=names(FLAGGED))
@@ -420,6 +494,29 @@ def test_check_flags(lab, _name, break_it, odd):
     result = invoke("check", str(lab))
     assert result.exit_code == 0, result.output
     assert odd in result.output
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_run_flags(lab, name):
+    break_it = next(case[1] for case in FLAGGED if case[0] == name)
+    code, words = RUNS[name]
+    break_it(lab)
+    result = invoke("run", str(lab), "--no-plot")
+    assert result.exit_code == code, result.output
+    if code:
+        assert_refused(result, words)
+        return
+    written = "".join((lab / "out" / file).read_text() for file in ("events.csv", "fixes.csv"))
+    for word in words:
+        assert word in written
+
+
+@pytest.mark.xfail(strict=True, reason="a run does not yet compare the samples it got with what the header states")
+@pytest.mark.parametrize("name", CUT)
+def test_run_tells_that_a_capture_is_cut_off(lab, name):
+    next(case[1] for case in FLAGGED if case[0] == name)(lab)
+    assert invoke("run", str(lab), "--no-plot").exit_code == 0
+    assert "header states" in (lab / "out" / "events.csv").read_text()
 
 
 def test_all_mistakes_of_all_files_are_told_at_once(lab):
@@ -463,7 +560,7 @@ def test_a_file_that_may_not_be_read(lab):
 def test_the_command_itself(lab):
     """Once through a real process: the exit code, the stream, and no traceback."""
     edit("channel = 0", "channel = 7")(lab)
-    command = [sys.executable, "-m", "sonofix.cli.main", "check", str(lab)]
+    command = [sys.executable, "-c", "from sonofix.cli.main import main; main()", "check", str(lab)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
     assert done.stderr.splitlines() == ['site.toml: microphone 1 "M1" channel = 7: capture.wav has channel 0 only']

@@ -17,11 +17,17 @@ from sonofix.acquire.bank import Bank, make_bank
 from sonofix.acquire.baseband import Band, band_limited, design_band, downconvert
 from sonofix.acquire.refine import Burst, refine
 from sonofix.acquire.search import Peak, search
-from sonofix.records import Detection, Floats, Prediction, Waveform
+from sonofix.records import Detection, Floats, Path, Prediction, Waveform
 
 NEAR_STRONGEST = 10 ** (-6 / 10)
 """Accepted in one pass: correlation power within this of the strongest. m-sequences isolate 9 dB at worst, so nothing
 this close can be another beacon's cross-talk."""
+
+EARLIER_PATH = 10 ** (-12 / 10)
+"""A path ahead of the strongest counts as the direct one if its power is above this share of the strongest's."""
+
+MOST_EARLIER = 4
+"""Rounds of looking for a still earlier path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,6 +136,14 @@ def acquire(
     return tuple(detection for _, detection in found)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Heard:
+    """One path of one emitter's burst, as found: its correlation power when it was."""
+
+    bank: Bank
+    power: float
+
+
 def _take_apart(
     plan: Plan,
     band: Band,
@@ -140,33 +154,81 @@ def _take_apart(
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction],
 ) -> list[tuple[Burst, Detection]]:
+    """All bursts of one band: the strongest path of each emitter loudest first, then whatever came before it."""
     bursts: list[Burst] = []
-    heard: list[Bank] = []
+    heard: list[_Heard] = []
     covariances: list[Floats] = []
     noise = np.zeros(0)
     residual = baseband
-    waiting = list(banks)
-    while waiting:
-        peaks = [(b, p) for b in waiting if (p := _search(plan, band, b, residual, start_s, windows, predictions))]
-        peaks = [(b, p) for b, p in peaks if p.found]
-        if not peaks:
-            break
-        strongest = max(p.power for _, p in peaks)
-        accepted = [(b, p) for b, p in peaks if p.power >= NEAR_STRONGEST * strongest]
-        for bank, peak in accepted:
+
+    def accept(found: list[tuple[Bank, Peak]]) -> None:
+        nonlocal bursts, covariances, residual, noise
+        for bank, peak in found:
             beta = peak.range_rate_mps / plan.sound_speed_mps
-            middle_s = peak.start_s + bank.waveform.duration_s / 2
-            bursts.append(Burst(bank.waveform, middle_s, beta, 0.0, 0j))
-            heard.append(bank)
-            waiting.remove(bank)
+            bursts.append(Burst(bank.waveform, peak.start_s + bank.waveform.duration_s / 2, beta, 0.0, 0j))
+            heard.append(_Heard(bank, peak.power))
         bursts, covariances, residual, noise = refine(
             baseband, start_s, band.rate_hz, bursts, plan.kappa_sd, band.whiteness
         )
-    return [
-        (burst, _detection(burst, bank, receiver, covariance, power, band))
-        for burst, bank, covariance, power in zip(bursts, heard, covariances, noise, strict=True)
-        if _whole(burst, baseband, start_s, band)
-    ]
+
+    def look(bank: Bank, closes_s: float = np.inf) -> Peak | None:
+        peak = _search(plan, band, bank, residual, start_s, windows, predictions, closes_s)
+        return peak if peak is not None and peak.found else None
+
+    waiting = list(banks)
+    while waiting:
+        peaks = [(bank, peak) for bank in waiting if (peak := look(bank)) is not None]
+        if not peaks:
+            break
+        strongest = max(peak.power for _, peak in peaks)
+        accepted = [(bank, peak) for bank, peak in peaks if peak.power >= NEAR_STRONGEST * strongest]
+        accept(accepted)
+        waiting = [bank for bank in waiting if all(bank is not other for other, _ in accepted)]
+    for _ in range(MOST_EARLIER):
+        earlier = []
+        for bank in banks:
+            paths = [(b, h) for b, h in zip(bursts, heard, strict=True) if h.bank is bank]
+            if paths:
+                first_s = min(b.arrival_s for b, _ in paths) - bank.waveform.duration_s / 2
+                peak = look(bank, first_s - 1.0 / band.half_width_hz)
+                strongest = max(h.power for _, h in paths)
+                if peak is None:
+                    continue
+                near = peak.start_s > first_s - bank.waveform.duration_s
+                if peak.power > strongest * max(EARLIER_PATH, bank.sidelobe if near else 0.0):
+                    earlier.append((bank, peak))
+        if not earlier:
+            break
+        accept(earlier)
+    return _first_paths(bursts, heard, covariances, noise, baseband, start_s, band, receiver)
+
+
+def _first_paths(
+    bursts: list[Burst],
+    heard: list[_Heard],
+    covariances: list[Floats],
+    noise: Floats,
+    baseband: NDArray[np.complex128],
+    start_s: float,
+    band: Band,
+    receiver: str,
+) -> list[tuple[Burst, Detection]]:
+    """Report each emitter by its first path, where the samples hold that whole."""
+    out = []
+    for bank in {id(h.bank): h.bank for h in heard}.values():
+        own = [i for i, h in enumerate(heard) if h.bank is bank]
+        first = min(own, key=lambda i: bursts[i].arrival_s)
+        paths = tuple(
+            Path(
+                bursts[i].arrival_s - bursts[first].arrival_s,
+                float(20 * np.log10(abs(bursts[i].gain) / max(abs(bursts[first].gain), 1e-30) + 1e-9)),
+            )
+            for i in own
+        )
+        if _whole(bursts[first], baseband, start_s, band):
+            found = _detection(bursts[first], bank, receiver, covariances[first], float(noise[first]), band, paths)
+            out.append((bursts[first], found))
+    return out
 
 
 def _search(
@@ -177,8 +239,10 @@ def _search(
     start_s: float,
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction],
+    before_s: float,
 ) -> Peak | None:
     opens_s, closes_s = windows[bank.emitter]
+    closes_s = min(closes_s, before_s)
     rates = None
     expected = predictions.get(bank.emitter)
     if expected is not None:
@@ -199,7 +263,9 @@ def _whole(burst: Burst, baseband: NDArray[np.complex128], start_s: float, band:
     )
 
 
-def _detection(burst: Burst, bank: Bank, receiver: str, covariance: Floats, noise: float, band: Band) -> Detection:
+def _detection(
+    burst: Burst, bank: Bank, receiver: str, covariance: Floats, noise: float, band: Band, paths: tuple[Path, ...]
+) -> Detection:
     # β and the time scale differ in sign
     sign = np.array([[1.0, -1.0], [-1.0, 1.0]])
     inside = slice(
@@ -216,4 +282,5 @@ def _detection(burst: Burst, bank: Bank, receiver: str, covariance: Floats, nois
         covariance=covariance * sign,
         amplitude=abs(burst.gain),
         snr_db=float(10 * np.log10(max(power, 1e-30) / in_band)),
+        paths=paths,
     )

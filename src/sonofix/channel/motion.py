@@ -7,7 +7,7 @@ the direction of travel unless given.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
@@ -145,9 +145,17 @@ class Sampled:
     position_m: Floats
     yaw_rad: Floats | None = None
     interpolation: Literal["cubic", "linear"] = "cubic"
+    _values: Floats = field(init=False, repr=False)  # (n, 4): position and unwrapped yaw at the rows
+    _slopes: Floats = field(init=False, repr=False)  # (n, 4): their three-point derivatives
 
     def __post_init__(self) -> None:
-        """Check shapes, finiteness and order."""
+        """Check shapes, finiteness and order; lay the curve.
+
+        Raises
+        ------
+        ValueError
+            Naming the field, and the row where times do not increase.
+        """
         n = len(self.time_s)
         if n < 2:
             raise ValueError(f"time_s has {n} rows; a sampled motion needs at least 2 (else use Still)")
@@ -167,24 +175,15 @@ class Sampled:
                 "times must strictly increase"
             )
 
-    def _row_yaw(self, slope: Floats) -> Floats:
-        if self.yaw_rad is not None:
-            return np.unwrap(np.asarray(self.yaw_rad, float))
-        speed = np.hypot(slope[:, 0], slope[:, 1])
-        moving = np.flatnonzero(speed > 1e-3)
-        if not moving.size:
-            return np.zeros(len(speed))
-        # rows that stand take the heading of the last moving row before them (the first: of the first one after)
-        last = np.maximum(np.searchsorted(moving, np.arange(len(speed)), side="right") - 1, 0)
-        return np.unwrap(np.arctan2(slope[:, 1], slope[:, 0])[moving[last]])
+        rows, order = np.asarray(self.time_s, float), 2 if n > 2 else 1
+        slope = np.gradient(np.asarray(self.position_m, float), rows, axis=0, edge_order=order)
+        yaw = _travel_yaw(slope) if self.yaw_rad is None else np.unwrap(np.asarray(self.yaw_rad, float))
+        object.__setattr__(self, "_values", np.column_stack([self.position_m, yaw]))
+        object.__setattr__(self, "_slopes", np.column_stack([slope, np.gradient(yaw, rows, edge_order=order)]))
 
     def at(self, time_s: Floats) -> Poses:
         """Return the poses at ``time_s`` (n,)."""
-        rows = np.asarray(self.time_s, float)
-        slope = np.gradient(np.asarray(self.position_m, float), rows, axis=0, edge_order=2 if len(rows) > 2 else 1)
-        yaw = self._row_yaw(slope)
-        values = np.column_stack([self.position_m, yaw])
-        slopes = np.column_stack([slope, np.gradient(yaw, rows, edge_order=2 if len(rows) > 2 else 1)])
+        rows, values, slopes = np.asarray(self.time_s, float), self._values, self._slopes
         wanted = np.asarray(time_s, float)
         inside = np.clip(wanted, rows[0], rows[-1])
         i = np.clip(np.searchsorted(rows, inside, side="right") - 1, 0, len(rows) - 2)
@@ -201,3 +200,13 @@ class Sampled:
             rate = (6 * x * (x - 1) * (a - b) + (1 - x) * (1 - 3 * x) * m0 + x * (3 * x - 2) * m1) / step
         rate = np.where(((wanted >= rows[0]) & (wanted <= rows[-1]))[:, None], rate, 0.0)
         return Poses(value[:, :3], rate[:, :3], value[:, 3])
+
+
+def _travel_yaw(slope: Floats) -> Floats:
+    """Heading of each row's velocity (n, 3), unwrapped; rows that stand keep the last heading before them."""
+    moving = np.flatnonzero(np.hypot(slope[:, 0], slope[:, 1]) > 1e-3)
+    if not moving.size:
+        return np.zeros(len(slope))
+    # before the first moving row, its own heading
+    last = np.maximum(np.searchsorted(moving, np.arange(len(slope)), side="right") - 1, 0)
+    return np.unwrap(np.arctan2(slope[:, 1], slope[:, 0])[moving[last]])

@@ -134,13 +134,26 @@ def simulate(
         Naming the argument or field that does not fit; from ``blocks``, a vehicle nearly as fast as sound.
     """
     _check(site, motions, rate_hz, duration_s, waveforms)
-    for name, value, low in (("noise_sd", noise_sd, 0.0), ("echo", echo, -1.0), ("seed", seed, 0)):
-        if not low <= value < np.inf:
-            raise ValueError(f"{name} = {value}; it must be {low:g} or more")
-    if echo > 1:
-        raise ValueError(f"echo = {echo}; a wall reflects at most all, 1")
-    if clip is not None and not clip > 0:
-        raise ValueError(f"clip = {clip}; it must be above 0 (full scale is 1)")
+    levels = {b: level.get(b) if isinstance(level, Mapping) else level for b in waveforms}
+    unset = [b for b, value in levels.items() if value is None]
+    if unset:
+        raise ValueError(f"level: none for beacon {', '.join(unset)}; give every beacon that sounds one")
+    for name, value, low, high in (
+        ("noise_sd", noise_sd, 0.0, 1e6),
+        ("echo", echo, -1.0, 1.0),
+        ("seed", seed, 0, 2**63),
+        ("clip", clip, 1e-6, 1e6),
+        ("absorption_db_per_m", absorption_db_per_m, 0.0, 1e3),
+        ("sound_speed_mps", sound_speed_mps, 1.0, 1e5),
+        ("clock_offset_s", clock_offset_s, -1e6, 1e6),
+        ("clock_drift", clock_drift, -0.01, 0.01),
+        ("tone.frequency_hz", tone and tone.frequency_hz, 0.0, rate_hz / 2),
+        ("tone.amplitude", tone and tone.amplitude, 0.0, 1e6),
+        *((f"level of beacon {b}", value, 0.0, 1e6) for b, value in levels.items()),
+        *((f"beacon_drift of {b}", value, -0.01, 0.01) for b, value in (beacon_drift or {}).items()),
+    ):
+        if value is not None and not low <= value <= high:
+            raise ValueError(f"{name} = {value:g}; it must lie from {low:g} to {high:g}")
     if echo:
         check_inside(site, motions, duration_s)
     schedule = site.schedule
@@ -163,7 +176,7 @@ def simulate(
         timing=timing,
         rate_hz=float(rate_hz),
         channels=1 + max(m.channel for m in site.microphones if m.channel is not None),
-        gain={b: level[b] if isinstance(level, Mapping) else level for b in waveforms},
+        gain={b: value for b, value in levels.items() if value is not None},
         absorption_db_per_m={
             b: absorption_of(site, w.carrier_hz) if absorption_db_per_m is None else absorption_db_per_m
             for b, w in waveforms.items()

@@ -13,6 +13,10 @@ SHARPEST_TURN_RAD = np.radians(170.0)
 """Beyond this a corner is a reversal, which no arc can round."""
 
 
+SHORTEST_LEG_M = 1e-6
+"""Neighbouring points nearer than this are the same point."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Path:
     """Pieces in order of arc length: straight where ``curvature`` is 0, else arcs from ``along`` towards ``inward``."""
@@ -117,8 +121,8 @@ def _laid(points: Floats, radius_m: float, closed: bool) -> _Path:
     """Pieces of the path: leg, arc, leg, …; closed ones start on the first leg and end with the first point's arc."""
     legs = np.diff(points, axis=0)
     length = np.linalg.norm(legs, axis=1)
-    if (length == 0).any():
-        k = int(np.flatnonzero(length == 0)[0])
+    if (length < SHORTEST_LEG_M).any():
+        k = int(np.flatnonzero(length < SHORTEST_LEG_M)[0])
         raise ValueError(f"points_m: points {k + 1} and {k + 2} are the same, {tuple(points[k].tolist())}; drop one")
     unit = legs / length[:, None]
     count = len(legs)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from sonofix.cli.console import Stopped, counted, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -78,59 +81,47 @@ def simulate(
     from sonofix import files
 
     if snr is not None and noise_db is not None:
-        _refuse("--snr and --noise-db both set the noise; give one of them")
-    try:
-        plan = files.read_site(site)
-        references = files.read_references(site.parent, plan)
-        _check_folder(site, out, force)
-        motions = _motions(plan, motion or [], vehicle or [], z)
-        waveforms = _waveforms(plan, references)
-        recording, truth = _made(
-            plan,
-            motions,
-            waveforms,
-            duration_s=duration,
-            rate_hz=rate,
-            snr_db=10.0 if snr is None else snr,
-            noise_db=noise_db,
-            level=level,
-            echo=echo,
-            absorption=absorption,
-            tone=None if tone_hz is None else (tone_hz, 10 ** (tone_db / 20)),
-            clock=(clock_offset, 1e-6 * clock_ppm, sync_jitter),
-            seed=seed,
-        )
-        _write(out, recording, truth, references, flac, force)
-    except files.RecordingError as error:
-        for problem in error.problems:
-            typer.echo(str(problem), err=True)
-        raise typer.Exit(2) from None
-    except ValueError as error:
-        _refuse(str(error))
+        raise ValueError("--snr and --noise-db both set the noise; give one of them")
+    plan = files.read_site(site)
+    references = files.read_references(site.parent, plan)
+    _check_folder(site, out, force)
+    motions = _motions(plan, motion or [], vehicle or [], z)
+    waveforms = _waveforms(plan, references)
+    recording, truth = _made(
+        plan,
+        motions,
+        waveforms,
+        duration_s=duration,
+        rate_hz=rate,
+        snr_db=10.0 if snr is None else snr,
+        noise_db=noise_db,
+        level=level,
+        echo=echo,
+        absorption=absorption,
+        tone=None if tone_hz is None else (tone_hz, 10 ** (tone_db / 20)),
+        clock=(clock_offset, 1e-6 * clock_ppm, sync_jitter),
+        seed=seed,
+    )
+    _write(out, recording, truth, references, flac, force)
     heard = sum(m.channel is not None for m in plan.microphones)
     typer.echo(
-        f"{out}: {duration:g} s at {rate} Hz, {len(waveforms)} beacon{'s' * (len(waveforms) != 1)}, "
-        f"{heard} microphone{'s' * (heard != 1)}, {len(truth)} vehicle{'s' * (len(truth) != 1)}"
+        f"{out}: {duration:g} s at {rate} Hz, {counted(len(waveforms), 'beacon')}, "
+        f"{counted(heard, 'microphone')}, {counted(len(truth), 'vehicle')}"
     )
-
-
-def _refuse(sentence: str) -> NoReturn:
-    typer.echo(" ".join(sentence.split()), err=True)
-    raise typer.Exit(2)
 
 
 def _check_folder(site: Path, out: Path, force: bool) -> None:
     """Refuse to write over the site file itself, or beside sensor files that another run measured."""
     if site.resolve() == (out / "site.toml").resolve():
-        _refuse(f"{out}: holds the site file itself, which would be rewritten; write to another folder")
+        raise ValueError(f"{out}: holds the site file itself, which would be rewritten; write to another folder")
     if (out / "site.toml").exists():
         if not force:
-            _refuse(f"{out}: is a recording already; write to another folder, or give --force to replace it")
+            raise ValueError(f"{out}: is a recording already; write to another folder, or give --force to replace it")
         from sonofix.files.recording import SENSOR_FILES
 
         others = [f"{stem}.csv" for stem in ("ranges", *SENSOR_FILES) if (out / f"{stem}.csv").exists()]
         if others:
-            _refuse(f"{out}: holds {', '.join(others)}, which would not fit new samples; move it away first")
+            raise ValueError(f"{out}: holds {', '.join(others)}, which would not fit new samples; move it away first")
 
 
 def _motions(site: Site, told: list[str], ids: list[str], z_m: float) -> dict[str, Motion]:
@@ -140,18 +131,18 @@ def _motions(site: Site, told: list[str], ids: list[str], z_m: float) -> dict[st
     if not known and not told:
         return {}
     if len(names) != len(told):
-        _refuse(
-            f"--motion is given {len(told)} times, for {len(names)} vehicle{'s' * (len(names) != 1)}; the site's "
-            f"vehicles are {listed}: name each with --vehicle and give it a --motion"
+        raise ValueError(
+            f"--motion is given {counted(len(told), 'time')}, for {counted(len(names), 'vehicle')} of the site's "
+            f"({listed}); give each a --motion, and where there are several its name by --vehicle"
         )
     for name in names:
         if name not in known:
-            _refuse(f"--vehicle {name}: the site has no such vehicle; it has {listed}")
+            raise ValueError(f"--vehicle {name}: the site has no such vehicle; it has {listed}")
         if names.count(name) > 1:
-            _refuse(f"--vehicle {name}: is given twice; a vehicle has one motion")
+            raise ValueError(f"--vehicle {name}: is given twice; a vehicle has one motion")
     left = [name for name in known if name not in names]
     if left:
-        _refuse(f"--motion: none for vehicle {', '.join(left)}; give each vehicle one, with --vehicle")
+        raise ValueError(f"--motion: none for vehicle {', '.join(left)}; give each vehicle one, with --vehicle")
     levels = {v.id: z_m if v.z_m is None else v.z_m for v in site.vehicles}
     return {name: parse_motion(text, levels[name], site, name) for name, text in zip(names, told, strict=True)}
 
@@ -260,8 +251,10 @@ def _made(
 ) -> tuple[Recording, dict[str, Truth]]:
     from sonofix import channel
 
-    if not 0 < duration_s < float("inf"):
+    if not 0 < duration_s < math.inf:
         raise ValueError(f"--duration {duration_s:g}: it must be positive, in s")
+    if math.isnan(snr_db) or (noise_db is not None and math.isnan(noise_db)):
+        raise ValueError("--snr or --noise-db: not a number; give it in dB")
     if not 0 <= echo <= 1:
         raise ValueError(f"--echo {echo:g}: a reflection coefficient lies from 0 to 1")
     gains = channel.direct_gains(site, motions, waveforms, duration_s, absorption)
@@ -295,22 +288,21 @@ def _write(
     flac: bool,
     force: bool,
 ) -> None:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
     from sonofix.files import write_recording
 
     if force and recording.sync_s is None:
         (out / "sync.csv").unlink(missing_ok=True)  # an earlier recording's would rule the new samples
-    columns = (TextColumn("simulating"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=recording.sample_count)
-        write_recording(
-            out,
-            recording,
-            truth,
-            audio="flac" if flac else "wav",
-            references=references,
-            overwrite=force,
-            on_block=lambda count: bar.update(task, completed=count),
-        )
+    with progress_bar() as bar:
+        task = bar.add_task("simulating", total=recording.sample_count)
+        try:
+            write_recording(
+                out,
+                recording,
+                truth,
+                audio="flac" if flac else "wav",
+                references=references,
+                overwrite=force,
+                on_block=lambda count: bar.update(task, completed=count),
+            )
+        except KeyboardInterrupt:
+            raise Stopped(f"{out}: stopped; the recording is not complete") from None

@@ -36,7 +36,7 @@ def draw_rings(axes: Axes, emitters: Mapping[str, Floats], size_m: float) -> Non
 def draw_nodes(axes: Axes, beacons: Mapping[str, Floats], microphones: Mapping[str, Floats], size_m: float) -> None:
     """Mark and name beacons and fixed microphones; neighbours too close to write at share one label.
 
-    Names stand on the far side of the node seen from the middle of all, with the height below them.
+    Names stand above the nodes, below those in the south, so that they keep out of the way; heights below the names.
     """
     everything = [*beacons.values(), *microphones.values()]
     if not everything:
@@ -65,32 +65,27 @@ def draw_nodes(axes: Axes, beacons: Mapping[str, Floats], microphones: Mapping[s
 def _label(
     axes: Axes, names: list[str], place: Floats, away: Floats, colour: str, height: bool, size_pt: float
 ) -> None:
-    away = away / (np.linalg.norm(away) or 1.0)
-    vertical = 1 if away[1] > 0.35 else -1 if away[1] < -0.35 else 0
-    side = "left" if away[0] > 0 else "right"
+    outward = 1 if away[1] >= -0.35 * np.linalg.norm(away) else -1
     lines = [(names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}", size_pt, colour, "bold")]
     if height:
         lines.append((f"z {place[2]:.2f} m", 8.5, style.MUTED, "normal"))
-    if vertical:
-        x, y, side = 0.0, 11.0 * vertical, "center"
-    else:
-        x, y = 14.0 * np.sign(away[0]), 6.0 * (len(lines) - 1)
-    rows = lines[::-1] if vertical > 0 else lines
+    y = 11.0 * outward
+    rows = lines[::-1] if outward > 0 else lines
     for text, points, ink, weight in rows:
         axes.annotate(
             text,
             (float(place[0]), float(place[1])),
-            xytext=(x, y),
+            xytext=(0.0, y),
             textcoords="offset points",
-            ha=side,
-            va={1: "bottom", 0: "center", -1: "top"}[vertical],
+            ha="center",
+            va="bottom" if outward > 0 else "top",
             fontsize=points,
             fontweight=weight,
             color=ink,
             path_effects=style.HALO,
             zorder=7,
         )
-        y += (points + 3.5) * (1 if vertical > 0 else -1)
+        y += (points + 3.5) * outward
 
 
 def _clusters(nodes: Mapping[str, Floats], reach_m: float) -> list[tuple[list[str], Floats]]:

@@ -35,9 +35,10 @@ def draw_heard(axes: Axes, series: Series) -> None:
     used, excluded = np.zeros((lanes, columns)), np.zeros((lanes, columns))
     np.add.at(used, (ranges.lane[ranges.used], column[ranges.used]), 1)
     np.add.at(excluded, (ranges.lane[~ranges.used], column[~ranges.used]), 1)
-    most = max(float((used + excluded).max()), 1.0)
-    bright = np.where(used + excluded > 0, 0.45 + 0.55 * (used + excluded) / most, 0.0)
-    share = used / np.maximum(used + excluded, 1)
+    heard = used + excluded
+    usual = max(float(np.percentile(heard[heard > 0], 75)), 1.0)
+    bright = np.where(heard > 0, 0.4 + 0.6 * np.minimum(heard / usual, 1.0), 0.0)
+    share = used / np.maximum(heard, 1)
     hue = share[..., None] * np.array(to_rgba(style.USED)[:3]) + (1 - share[..., None]) * np.array(
         to_rgba(style.EXCLUDED)[:3]
     )

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from sonofix.draw import style, way
 from sonofix.draw.nodes import draw_nodes, draw_rings
-from sonofix.draw.series import Series
+from sonofix.draw.series import Series, TrackSeries
 from sonofix.draw.zoom import open_zoom, scale_bar
 from sonofix.records import Floats, Recording, Truth
 
@@ -34,7 +34,7 @@ def draw_plan(axes: Axes, recording: Recording, series: Series, truths: Mapping[
     clock = Normalize(*_wide(series.span_s)) if len(vehicles) == 1 else None
     zoom = open_zoom(axes, series, truths) if len(vehicles) == 1 else None
     enlarge = 1 if zoom else way.enlargement(list(series.tracks.values()), size_m)
-    marks = max(18 // max(len(vehicles), 1), 4)
+    apart_m, most = 0.08 * size_m, max(18 // max(len(vehicles), 1), 5)
     for vehicle, colour in colours.items():
         if vehicle in truths:
             _true_path(axes, truths[vehicle])
@@ -43,10 +43,9 @@ def draw_plan(axes: Axes, recording: Recording, series: Series, truths: Mapping[
         if vehicle in series.tracks and zoom is None:
             track = series.tracks[vehicle]
             way.draw_line(axes, track, clock, colour)
-            way.draw_ellipses(axes, track, way.spaced(track, marks), clock, colour, enlarge, 0.3 * size_m)
-            way.draw_headings(axes, track, way.spaced(track, marks, 0.0)[1:])
-            words = ("start", "end") if clock else ("", vehicle)
-            way.mark_ends(axes, track, style.INK if clock else colour, words)
+            way.draw_ellipses(axes, track, way.spaced(track, apart_m, most), clock, colour, enlarge, 0.3 * size_m)
+            way.draw_headings(axes, track, way.spaced(track, apart_m, most, 0.0)[1:])
+            way.mark_ends(axes, track, style.INK if clock else colour, _end_names(track, clock, vehicle, size_m))
     if zoom is not None:
         _parked(axes, zoom, series, truths, clock)
     if not any(len(track.time_s) for track in series.tracks.values()) and not any(
@@ -65,6 +64,14 @@ def _places(recording: Recording) -> tuple[dict[str, Floats], dict[str, Floats]]
         node.id: np.asarray(node.position_m, float) for node in site.microphones if node.position_m is not None
     }
     return beacons, microphones
+
+
+def _end_names(track: TrackSeries, clock: Normalize | None, vehicle: str, size_m: float) -> tuple[str, str]:
+    """Return what to write at the start and the end; one label where they would stand on each other."""
+    if clock is None:
+        return "", vehicle
+    near = float(np.linalg.norm(track.position_m[-1, :2] - track.position_m[0, :2])) < 0.035 * size_m
+    return ("", "start, end") if near else ("start", "end")
 
 
 def _wide(span: tuple[float, float]) -> tuple[float, float]:

@@ -107,6 +107,7 @@ def gather(steps: Sequence[Step]) -> Series:
 def _track(rows: list[Estimate]) -> TrackSeries:
     rows = sorted(rows, key=lambda estimate: estimate.time_s)
     covariance = np.full((len(rows), 3, 3), np.nan)
+    predicted = np.array([estimate.source == "predicted" for estimate in rows], bool)
     for i, estimate in enumerate(rows):
         axes = [k for k, name in enumerate("xyz") if name in estimate.states]
         places = [estimate.states.index("xyz"[k]) for k in axes]
@@ -117,7 +118,7 @@ def _track(rows: list[Estimate]) -> TrackSeries:
         velocity_mps=np.array([estimate.velocity_mps for estimate in rows]).reshape(-1, 3),
         yaw_rad=np.array([np.nan if estimate.yaw_rad is None else estimate.yaw_rad for estimate in rows]),
         covariance_m2=covariance,
-        predicted=np.array([estimate.source == "predicted" for estimate in rows], bool),
+        predicted=predicted & ~predicted.all(),  # on a grid of its own every row is predicted: nothing to tell apart
     )
 
 

@@ -92,14 +92,15 @@ def enlargement(tracks: list[TrackSeries], size_m: float) -> int:
     return 1 if wanted < 2 else int(min(style.round_below(wanted), 500))
 
 
-def spaced(track: TrackSeries, count: int, phase: float = 0.5) -> list[int]:
-    """Return rows evenly spread along the distance gone; the last row alone where nothing moves."""
+def spaced(track: TrackSeries, apart_m: float, most: int, phase: float = 0.5) -> list[int]:
+    """Return rows evenly spread along the distance gone, at most so many; the last row alone where nothing moves."""
     xy = track.position_m[:, :2]
     if len(xy) == 0:
         return []
     gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     if len(xy) < 3 or gone[-1] <= 0:
         return [len(xy) - 1]
+    count = int(np.clip(gone[-1] / apart_m, 2, most))
     marks = (np.arange(count) + phase) / count * gone[-1]
     return sorted({int(np.argmin(np.abs(gone - mark))) for mark in marks})
 

@@ -85,7 +85,8 @@ def _geometry(site: Site) -> Iterator[str]:
     needed = 2 + (not level_known) + (not clock_known)
     if len(places) < needed:
         unknowns = "x, y" + ("" if level_known else ", z") + ("" if clock_known else " and the clock")
-        yield f"{len(places)} fixed {kind} cannot give {unknowns}: {needed} are needed in every epoch"
+        few = f"{len(places)} fixed {kind if len(places) > 1 else kind[:-1]}"
+        yield f"{few} cannot give {unknowns}: {needed} are needed in every epoch"
     if len(places) < 2:
         return
     spread = _spread(places)
@@ -167,7 +168,7 @@ def _samples(recording: Recording, figures: CaptureFigures) -> Iterator[str]:
     for channel, peak in enumerate(figures.peak):
         name = f"channel {channel}" + (f" ({channels[channel]})" if channel in channels else "")
         if figures.not_finite[channel]:
-            yield f"{name}: {figures.not_finite[channel]} samples are NaN or infinite"
+            yield f"{name}: {figures.not_finite[channel]} samples NaN or infinite"
         if peak == 0:
             yield f"{name} is silent throughout"
         elif peak < 1e-3:

@@ -67,5 +67,6 @@ def shown(value: object) -> str:
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
     """Return "did you mean x?" where a known word is near, else the known words."""
-    near = difflib.get_close_matches(word.lower(), known, n=1, cutoff=0.6)
-    return f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+    plain = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(word.lower(), plain, n=1, cutoff=0.6)
+    return f"did you mean {plain[near[0]]}?" if near else f"known are {', '.join(known)}"

@@ -32,7 +32,7 @@ def _for_toml(part: Any) -> Any:
         return [_for_toml(item) for item in part]
     if not isinstance(part, dict):
         return part
-    kept = {key: value for key, value in part.items() if not (key == "default" and value is None)}
+    kept = {key: value for key, value in part.items() if value is not None}
     if isinstance(kept.get("title"), str):
         del kept["title"]
     if "anyOf" in kept:

@@ -86,7 +86,7 @@ def read_site(path: str | Path) -> Site:
         With every mistake in the file.
     """
     path = Path(path)
-    if path.is_dir():
+    if path.is_dir() and path.name != FILE_NAME:
         path = path / FILE_NAME
     return parse_site(read_text(path, path.name), path.name)
 

@@ -1,0 +1,78 @@
+"""What all commands share in speaking to the user: lines, lengths, tables, progress, and how a stop is told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+
+class Stopped(KeyboardInterrupt):
+    """Ctrl-C after the outputs were closed; the message says what was kept."""
+
+
+def speaker() -> Console:
+    """Return a console on stdout that prints text as it is."""
+    from rich.console import Console
+
+    return Console(highlight=False, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Open a bar on stderr that vanishes at the end; nothing is shown where stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=40),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield bar
+
+
+def print_table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:
+    """Print a table: a name and a figure for each column a row; rows without any figure are left out."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=Text(title, style="bold"), title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False
+    )
+    table.add_column("")
+    for column in columns:
+        table.add_column(Text(column), justify="right")
+    for name, cells in rows.items():
+        if any(cells):
+            table.add_row(Text(name), *(Text(cell) for cell in cells))
+    speaker().print(table)
+
+
+def length_text(length_m: float | None) -> str:
+    """Write a length to three figures in the unit in which it reads well; empty where it is not known."""
+    if length_m is None:
+        return ""
+    size = abs(length_m)
+    factor, unit = (1e3, "mm") if size < 0.2 else (1e2, "cm") if size < 1.0 else (1.0, "m")
+    value = length_m * factor
+    digits = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{value:.{digits}f} {unit}"
+
+
+def figure_text(value: float | None, form: str, unit: str = "") -> str:
+    """Write a figure in the given format with its unit; empty where it is not known."""
+    return "" if value is None else f"{value:{form}} {unit}".rstrip()
+
+
+def counted(count: int, name: str) -> str:
+    """Write a count with its noun: "1 epoch", "3 epochs"."""
+    return f"{count} {name}" + ("" if count == 1 else "s")

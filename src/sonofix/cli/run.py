@@ -1,0 +1,183 @@
+"""`sonofix run`: a recording in, ranges, fixes, track and a picture out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sonofix.cli.console import Stopped, counted, print_table, progress_bar, speaker
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.progress import Progress, TaskID
+
+    from sonofix.cli.tally import Tally
+    from sonofix.records import Recording, Step, Waveform
+
+# A picture of more epochs than this looks the same, and would hold a long run in memory.
+_MOST_DRAWN = 5000
+
+
+def run(
+    recording: Annotated[Path, typer.Argument(help="Recording folder: site.toml, and samples or ranges.csv.")],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder to write to. [default: out/ in the recording]")
+    ] = None,
+    plot: Annotated[bool, typer.Option(help="Draw track.png.")] = True,
+    rate: Annotated[
+        float | None, typer.Option(help="Rows of track.csv a second (Hz). [default: one an epoch]", min=1e-3, max=1e4)
+    ] = None,
+) -> None:
+    """Turn a recording into ranges, fixes, a track and a picture."""
+    run_folder(recording, out or recording / "out", plot, rate)
+
+
+def run_folder(folder: Path, out: Path, plot: bool, rate_hz: float | None) -> None:
+    """Run a recording folder, write everything to `out`, and print the summary.
+
+    Raises
+    ------
+    RecordingError
+        With all mistakes of the recording, or where `out` cannot be written to.
+    ValueError
+        If the recording holds no epoch.
+    Stopped
+        After Ctrl-C, outputs closed.
+    """
+    from sonofix import files, flow
+    from sonofix.cli.tally import Tally
+
+    recording = files.read_recording(folder, to_run=True)
+    truths = files.read_truth(folder)
+    tally, sample = Tally(recording.site), _Sample(_MOST_DRAWN)
+    waveforms = _waveforms(folder, recording)
+    try:
+        with progress_bar() as bar:
+            watched, on_step = _watched(recording, bar)
+            steps = flow.run(watched, waveforms, rate_hz)
+            files.write_run(out, _seen(steps, tally.add, sample.add, on_step), recording.site)
+    except KeyboardInterrupt:
+        kept = f"{out} holds the first {counted(tally.epochs, 'epoch')}" if tally.epochs else "nothing was kept"
+        raise Stopped(f"stopped; {kept}") from None
+    picture = out / "track.png"
+    picture.unlink(missing_ok=True)
+    if not tally.epochs:
+        raise ValueError(f"{folder}: holds no whole epoch{_length(recording)}; record at least one burst to its end")
+    _summarise(folder, out, tally, scored=bool(truths))
+    if plot:
+        _draw(picture, recording, sample.steps(), truths)
+    speaker().print(f"Written to {out}")
+
+
+def _waveforms(folder: Path, recording: Recording) -> dict[str, Waveform]:
+    """Return what the coded beacons send; nothing where the recording states ranges itself."""
+    if recording.blocks is None:
+        return {}
+    from sonofix import files, flow
+    from sonofix.signals.waveform import waveform_of
+
+    site = recording.site
+    speed, _ = flow.sound_speed(site)
+    references = files.read_references(folder, site)
+    return {beacon.id: waveform_of(site, beacon, speed, references.get(beacon.id)) for beacon in site.coded_beacons}
+
+
+def _watched(recording: Recording, bar: Progress) -> tuple[Recording, Callable[[Step], None]]:
+    """Return the recording with its samples counted as they are read, and what counts rows where it has none."""
+    blocks = recording.blocks
+    name = recording.site.name
+    if blocks is None:
+        rows = 0 if recording.ranges is None else len(recording.ranges.time_s)
+        task = bar.add_task(name, total=rows or None)
+        return recording, lambda step: bar.advance(task, len(step.ranges))
+    task = bar.add_task(name, total=recording.sample_count)
+    return replace(recording, blocks=lambda length: _counted_blocks(blocks(length), bar, task)), lambda step: None
+
+
+def _counted_blocks(
+    blocks: Iterator[NDArray[np.float32]], bar: Progress, task: TaskID
+) -> Iterator[NDArray[np.float32]]:
+    for block in blocks:
+        yield block
+        bar.advance(task, len(block))
+
+
+def _seen(steps: Iterator[Step], *watchers: Callable[[Step], None]) -> Iterator[Step]:
+    """Pass steps on; each watcher is shown a step once it has been written."""
+    for step in steps:
+        yield step
+        for watcher in watchers:
+            watcher(step)
+
+
+class _Sample:
+    """A fair sample of a run's steps, of bounded size (Vitter 1985, algorithm R), for the picture.
+
+    Every step is as likely to be kept as any other, so that beacons that take turns are all seen.
+    """
+
+    def __init__(self, most: int) -> None:
+        import numpy as np
+
+        self._most, self._count = most, 0
+        self._kept: list[tuple[int, Step]] = []
+        self._rng = np.random.default_rng(0)
+
+    def add(self, step: Step) -> None:
+        """Show it the next step."""
+        place = self._count if self._count < self._most else int(self._rng.integers(self._count + 1))
+        if place == len(self._kept):
+            self._kept.append((self._count, step))
+        elif place < self._most:
+            self._kept[place] = (self._count, step)
+        self._count += 1
+
+    def steps(self) -> list[Step]:
+        """Return the kept steps in their order."""
+        return [step for _, step in sorted(self._kept, key=lambda kept: kept[0])]
+
+
+def _length(recording: Recording) -> str:
+    if recording.sample_count is None or not recording.rate_hz:
+        return ""
+    return f" (it is {recording.sample_count / recording.rate_hz:.3g} s long)"
+
+
+def _summarise(folder: Path, out: Path, tally: Tally, scored: bool) -> None:
+    from sonofix.cli.score import score_run, track_rows
+
+    vehicles = tally.vehicles
+    print_table(f"{tally.name}: {tally.headline()}", vehicles or ("",), tally.rows())
+    if scored:
+        found = score_run(folder, out)
+        if found.track:
+            rows = track_rows(found.track)
+            keep = ("position error, rms", "95 % within", "height error, rms", "heading error, rms", "inside 2 sd")
+            rows = {name: rows[name] for name in (*keep, "NEES of x, y (2 is right)")}
+            print_table("Against the truth", tuple(found.track), rows)
+        if found.ranges is not None and found.ranges.used.count:
+            from sonofix.cli.console import length_text
+
+            used = found.ranges.used
+            speaker().print(
+                f"Ranges used, against the truth: rms {length_text(used.rms_m)}, {used.beyond_5cm} beyond 5 cm"
+            )
+    for line in tally.remarks():
+        speaker().print(line)
+
+
+def _draw(picture: Path, recording: Recording, steps: list[Step], truths: dict) -> None:
+    """Draw the picture; say so where Matplotlib is not installed."""
+    try:
+        from sonofix.draw.track import draw_track
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("matplotlib"):
+            raise
+        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
+        return
+    draw_track(recording, steps, truths).savefig(picture)

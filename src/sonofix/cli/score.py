@@ -1,0 +1,221 @@
+"""`sonofix score`: what a run wrote against the recording's truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sonofix.cli.console import counted, figure_text, length_text, print_table
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from sonofix.records import Floats
+    from sonofix.score import RangeColumns, RangeFigures, TrackColumns, TrackFigures
+    from sonofix.site import Site
+
+
+def score(
+    recording: Annotated[Path, typer.Argument(help="Recording folder with a truth.csv.")],
+    out: Annotated[
+        Path | None, typer.Argument(help="Folder that `sonofix run` wrote. [default: out/ in the recording]")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, lengths in m.")] = False,
+) -> None:
+    """Score ranges and track of a run against the recording's truth."""
+    scored = score_run(recording, out or recording / "out")
+    if as_json:
+        typer.echo(json.dumps(asdict(scored), indent=2, allow_nan=False))
+        return
+    if scored.ranges is not None:
+        print_table("Ranges", ("used", "all"), _range_rows(scored.ranges))
+    if scored.track:
+        print_table("Track", tuple(scored.track), track_rows(scored.track))
+    else:
+        typer.echo("No row of track.csv lies in the time of the truth.")
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """Figures of one run: of its ranges (None where it wrote none), and of each vehicle's track."""
+
+    ranges: RangeFigures | None
+    track: Mapping[str, TrackFigures]
+
+
+def score_run(recording: Path, out: Path) -> Scored:
+    """Score what a run wrote to a folder.
+
+    Raises
+    ------
+    RecordingError
+        If the recording has no truth, or the folder holds no run or one with mistakes in its files.
+    """
+    from sonofix import air, files
+    from sonofix.score import score_ranges, score_track
+
+    site = files.read_site(recording / "site.toml")
+    truths = files.read_truth(recording)
+    if not truths:
+        remedy = "there is none, so there is nothing to score against"
+        raise files.RecordingError([files.Problem(str(recording / "truth.csv"), "", None, remedy)])
+    if not any((out / name).is_file() for name in ("ranges.csv", "track.csv")):
+        remedy = f"holds neither ranges.csv nor track.csv; first: sonofix run {recording}"
+        raise files.RecordingError([files.Problem(str(out), "", None, remedy)])
+    ranges, track = read_ranges(out), read_track(out, site)
+    # the speed matters only to say how long ago a moving beacon's sound left it: the simple formula is near enough
+    speed = site.air.sound_speed_mps or float(air.sound_speed_linear_mps(site.air.temperature_c))
+    figures = {vehicle: score_track(truths[vehicle], rows) for vehicle, rows in track.items() if vehicle in truths}
+    return Scored(
+        ranges=None if ranges is None else score_ranges(site, truths, ranges, speed),
+        track={vehicle: found for vehicle, found in figures.items() if found is not None},
+    )
+
+
+def read_ranges(out: Path) -> RangeColumns | None:
+    """Read `ranges.csv` of a run; None where it is not there.
+
+    Raises
+    ------
+    RecordingError
+        Where a needed column is missing or a cell is no number.
+    """
+    import numpy as np
+
+    from sonofix.score import RangeColumns
+
+    sheet = _Sheet.read(out / "ranges.csv", ("time_s", "from", "to", "range_m"))
+    if sheet is None:
+        return None
+    used = sheet.text("used", "1")
+    return RangeColumns(
+        time_s=sheet.numbers("time_s"),
+        emitter=tuple(sheet.text("from")),
+        receiver=tuple(sheet.text("to")),
+        range_m=sheet.numbers("range_m"),
+        sd_m=sheet.numbers("sd_m"),
+        range_rate_mps=sheet.numbers("range_rate_mps"),
+        clock_offset_m=sheet.numbers("clock_offset_m"),
+        used=np.array([cell.strip().lower() in ("1", "true") for cell in used], bool),
+    )
+
+
+def read_track(out: Path, site: Site) -> dict[str, TrackColumns]:
+    """Read `track.csv` of a run, by vehicle; empty where it is not there. Errors as `read_ranges`."""
+    import numpy as np
+
+    from sonofix.score import TrackColumns
+
+    sheet = _Sheet.read(out / "track.csv", ("time_s", "x_m", "y_m"))
+    if sheet is None:
+        return {}
+    only = site.vehicles[0].id if site.vehicles else ""
+    names = np.array([name or only for name in sheet.text("vehicle")])
+    time, yaw = sheet.numbers("time_s"), sheet.numbers("yaw_rad")
+    place, velocity, sd = (
+        np.column_stack([sheet.numbers(f"{prefix}{axis}{unit}") for axis in "xyz"])
+        for prefix, unit in (("", "_m"), ("v", "_mps"), ("sd_", "_m"))
+    )
+    variance = np.full((len(time), 3, 3), np.nan)
+    variance[:, range(3), range(3)] = sd**2
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        variance[:, i, j] = variance[:, j, i] = np.where(np.isnan(sd[:, i] + sd[:, j]), np.nan, 0.0)
+    tracks = {}
+    for vehicle in dict.fromkeys(names.tolist()):
+        rows = names == vehicle
+        tracks[vehicle] = TrackColumns(time[rows], place[rows], velocity[rows], yaw[rows], variance[rows])
+    return tracks
+
+
+class _Sheet:
+    """A CSV file of a run as columns of text."""
+
+    def __init__(self, path: Path, columns: Mapping[str, list[str]], length: int) -> None:
+        self._path, self._columns, self._length = path, columns, length
+
+    @classmethod
+    def read(cls, path: Path, needed: tuple[str, ...]) -> _Sheet | None:
+        """Read the file; None where it is not there."""
+        from sonofix.files import Problem, RecordingError
+
+        if not path.exists():
+            return None
+        try:
+            with path.open(newline="", encoding="utf-8") as file:
+                header, *rows = list(csv.reader(file)) or [[]]
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise RecordingError([Problem(str(path), "", None, f"is no CSV text: {error}")]) from None
+        problems = [
+            Problem(str(path), "line 1", ",".join(header), f"column {name} is missing; is this a file of sonofix run?")
+            for name in needed
+            if name not in header
+        ]
+        problems += [
+            Problem(str(path), f"line {i}", None, f"has {counted(len(row), 'cell')} for {len(header)} columns")
+            for i, row in enumerate(rows, 2)
+            if len(row) != len(header)
+        ][:5]
+        if problems:
+            raise RecordingError(problems)
+        return cls(path, {name: [row[k] for row in rows] for k, name in enumerate(header)}, len(rows))
+
+    def text(self, name: str, default: str = "") -> list[str]:
+        return self._columns.get(name, [default] * self._length)
+
+    def numbers(self, name: str) -> Floats:
+        """Return a column as numbers, NaN where a cell is empty or the column is missing."""
+        import numpy as np
+
+        from sonofix.files import Problem, RecordingError
+
+        values: np.ndarray = np.full(self._length, np.nan)
+        for i, cell in enumerate(self.text(name)):
+            try:
+                values[i] = float(cell) if cell.strip() else np.nan
+            except ValueError:
+                field = f"line {i + 2}, {name}"
+                raise RecordingError([Problem(str(self._path), field, cell, "must be a number")]) from None
+        return values
+
+
+def _range_rows(figures: RangeFigures) -> dict[str, tuple[str, str]]:
+    both = (figures.used, figures.every)
+    return {
+        "rows judged": (str(both[0].count), str(both[1].count)),
+        "bias (median)": (length_text(both[0].median_m), length_text(both[1].median_m)),
+        "rms": (length_text(both[0].rms_m), length_text(both[1].rms_m)),
+        "95 % within": (length_text(both[0].p95_m), length_text(both[1].p95_m)),
+        "beyond 5 cm": (str(both[0].beyond_5cm), str(both[1].beyond_5cm)),
+        "rms of the others": (length_text(both[0].rms_within_5cm_m), length_text(both[1].rms_within_5cm_m)),
+        "error over stated sd, rms": (figure_text(figures.error_over_sd_rms, ".2f"), ""),
+        "range rate, rms": (figure_text(_times(figures.range_rate_rms_mps, 1e3), ".1f", "mm/s"), ""),
+        "share of expected": (figure_text(_times(figures.share_of_expected, 100), ".1f", "%"), ""),
+    }
+
+
+def track_rows(track: Mapping[str, TrackFigures]) -> dict[str, list[str]]:
+    """Return the rows of a table of track figures, a column a vehicle."""
+    every = list(track.values())
+    return {
+        "rows in the truth's time": [str(f.rows) for f in every],
+        "position error, rms": [length_text(f.rmse_xy_m) for f in every],
+        "median": [length_text(f.median_xy_m) for f in every],
+        "95 % within": [length_text(f.p95_xy_m) for f in every],
+        "largest": [length_text(f.max_xy_m) for f in every],
+        "height error, rms": [length_text(f.rmse_z_m or None) for f in every],
+        "heading error, rms": [figure_text(_times(f.rmse_yaw_rad, 57.29577951308232), ".2f", "°") for f in every],
+        "velocity error, rms": [figure_text(_times(f.velocity_rms_mps, 1e3), ".1f", "mm/s") for f in every],
+        "inside 2 sd": [figure_text(_times(f.inside_2sd, 100), ".1f", "%") for f in every],
+        "NEES of x, y (2 is right)": [figure_text(f.nees_xy, ".2f") for f in every],
+        "longest gap": [figure_text(f.longest_gap_s, ".2f", "s") for f in every],
+    }
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
