@@ -64,6 +64,24 @@ def test_a_cut_wav_reads_to_its_end(tmp_path, noise):
     np.testing.assert_array_equal(np.concatenate(list(capture.blocks(4096))), noise[:20000])
 
 
+def test_a_cut_rf64_reads_to_its_end(tmp_path, noise):
+    path = tmp_path / "capture.wav"
+    soundfile.write(path, noise, RATE_HZ, format="RF64")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - 4 * 10000])
+    capture = find_capture(tmp_path)
+    assert capture.sample_count == len(noise)
+    read = np.concatenate(list(capture.blocks(4096)))
+    np.testing.assert_array_equal(read, noise[: len(read)])
+    assert len(read) == len(noise) - 10000
+
+
+def test_other_formats_are_refused(tmp_path, noise):
+    soundfile.write(tmp_path / "capture.wav", noise, RATE_HZ, format="OGG", subtype="VORBIS")
+    with pytest.raises(RecordingError, match="must be FLAC or WAV"):
+        find_capture(tmp_path)
+
+
 def test_a_cut_flac_reads_nearly_to_its_end(tmp_path, noise):
     """All whole frames (4096 samples) but what shares a read of 1024 with the cut."""
     path = tmp_path / "capture.flac"

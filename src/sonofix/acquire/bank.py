@@ -37,9 +37,6 @@ class Bank:
     replicas : complex64 (m, n)
         Unit energy, sampled at the base band's rate; sample 0 stands ``lead_s`` before the burst's start.
     lead_s : float
-    sidelobe : float
-        Correlation power, relative to a burst's own, that may be its sidelobe and nothing else: echoes pile up the
-        code's sidelobes ahead of the first arrival, and a real transducer's burst is not quite the replica.
     """
 
     emitter: str
@@ -47,7 +44,6 @@ class Bank:
     range_rate_mps: Floats
     replicas: NDArray[np.complex64]
     lead_s: float
-    sidelobe: float
 
     def spectra(self, length: int, rows: Sequence[int] | slice = slice(None)) -> NDArray[np.complex64]:
         """Conjugate spectra (m, length) of the replicas, ready to multiply with a spectrum of samples."""
@@ -89,12 +85,4 @@ def make_bank(emitter: str, waveform: Waveform, band: Band, max_rate_mps: float,
         values = sample(waveform.signature, waveform.rate_hz, waveform.start_s, tau)
         values *= np.exp(-2j * np.pi * waveform.carrier_hz * beta * u)
         replicas[row] = values / np.linalg.norm(values)
-    return Bank(emitter, waveform, rates, replicas, lead_s, _sidelobe(replicas[half], band))
-
-
-def _sidelobe(replica: NDArray[np.complex64], band: Band) -> float:
-    """Twice the highest sidelobe of a burst's own correlation in amplitude, as power; at most all of it."""
-    length = 2 * len(replica)
-    correlation = np.abs(np.fft.ifft(np.abs(np.fft.fft(replica, length)) ** 2))[: len(replica)]
-    beyond = int(np.ceil(2.0 * band.rate_hz / band.half_width_hz))
-    return float(min(1.0, (2.0 * correlation[beyond:].max(initial=0.0)) ** 2))
+    return Bank(emitter, waveform, rates, replicas, lead_s)

@@ -23,11 +23,18 @@ NEAR_STRONGEST = 10 ** (-6 / 10)
 """Accepted in one pass: correlation power within this of the strongest. m-sequences isolate 9 dB at worst, so nothing
 this close can be another beacon's cross-talk."""
 
-EARLIER_PATH = 10 ** (-12 / 10)
-"""A path ahead of the strongest counts as the direct one if its power is above this share of the strongest's."""
+PATH_POWER = 10 ** (-12 / 10)
+"""Echoes below this share of a burst's strongest path are left alone, and so is what comes before it."""
 
-MOST_EARLIER = 4
-"""Rounds of looking for a still earlier path."""
+MOST_PATHS = 8
+"""Of one burst."""
+
+ROUGH_ITERATIONS = 3
+FULL_ITERATIONS = 12
+"""Of the joint refinement while paths are still being found, and when all are."""
+
+MOST_ROUNDS = 40
+"""Of searching in what is left: a bound on the work, not expected to be met."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,6 +150,12 @@ class _Heard:
     bank: Bank
     power: float
 
+    @property
+    def sounds_s(self) -> float:
+        """From its first chip until its last has rung off, slowed by 1 % at most."""
+        w = self.bank.waveform
+        return 1.01 * (len(w.envelope) / w.rate_hz + w.start_s)
+
 
 def _take_apart(
     plan: Plan,
@@ -154,7 +167,7 @@ def _take_apart(
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction],
 ) -> list[tuple[Burst, Detection]]:
-    """All bursts of one band: the strongest path of each emitter loudest first, then whatever came before it."""
+    """All bursts of one band, loudest first, each with its echoes."""
     bursts: list[Burst] = []
     heard: list[_Heard] = []
     covariances: list[Floats] = []
@@ -167,40 +180,46 @@ def _take_apart(
             beta = peak.range_rate_mps / plan.sound_speed_mps
             bursts.append(Burst(bank.waveform, peak.start_s + bank.waveform.duration_s / 2, beta, 0.0, 0j))
             heard.append(_Heard(bank, peak.power))
-        bursts, covariances, residual, noise = refine(
-            baseband, start_s, band.rate_hz, bursts, plan.kappa_sd, band.whiteness
+        settle(ROUGH_ITERATIONS)
+
+    def settle(iterations: int) -> None:
+        """Refine all paths together on the stretch of samples in which any of them sounds."""
+        nonlocal bursts, covariances, residual, noise
+        begin = min(b.arrival_s - b.waveform.duration_s / 2 - 2e-3 for b in bursts)
+        end = max(b.arrival_s - b.waveform.duration_s / 2 + h.sounds_s for b, h in zip(bursts, heard, strict=True))
+        first = max(0, int((begin - start_s) * band.rate_hz))
+        last = int((end - start_s) * band.rate_hz) + 1
+        bursts, covariances, left, noise = refine(
+            baseband[first:last],
+            start_s + first / band.rate_hz,
+            band.rate_hz,
+            bursts,
+            plan.kappa_sd,
+            band.whiteness,
+            iterations,
         )
+        residual = baseband.copy()
+        residual[first:last] = left
 
-    def look(bank: Bank, closes_s: float = np.inf) -> Peak | None:
-        peak = _search(plan, band, bank, residual, start_s, windows, predictions, closes_s)
-        return peak if peak is not None and peak.found else None
-
-    waiting = list(banks)
-    while waiting:
-        peaks = [(bank, peak) for bank in waiting if (peak := look(bank)) is not None]
+    for _ in range(MOST_ROUNDS):
+        peaks: list[tuple[Bank, Peak]] = []
+        for bank in banks:
+            paths = [(b, h) for b, h in zip(bursts, heard, strict=True) if h.bank is bank]
+            if len(paths) >= MOST_PATHS:
+                continue
+            known_s = [b.arrival_s - bank.waveform.duration_s / 2 for b, _ in paths]
+            peak = _search(plan, band, bank, residual, start_s, windows, predictions, known_s)
+            if peak is None or not peak.found:
+                continue
+            if peak.power > PATH_POWER * max((h.power for _, h in paths), default=0.0):
+                peaks.append((bank, peak))
         if not peaks:
             break
         strongest = max(peak.power for _, peak in peaks)
-        accepted = [(bank, peak) for bank, peak in peaks if peak.power >= NEAR_STRONGEST * strongest]
-        accept(accepted)
-        waiting = [bank for bank in waiting if all(bank is not other for other, _ in accepted)]
-    for _ in range(MOST_EARLIER):
-        earlier = []
-        for bank in banks:
-            paths = [(b, h) for b, h in zip(bursts, heard, strict=True) if h.bank is bank]
-            if paths:
-                first_s = min(b.arrival_s for b, _ in paths) - bank.waveform.duration_s / 2
-                peak = look(bank, first_s - 1.0 / band.half_width_hz)
-                strongest = max(h.power for _, h in paths)
-                if peak is None:
-                    continue
-                near = peak.start_s > first_s - bank.waveform.duration_s
-                if peak.power > strongest * max(EARLIER_PATH, bank.sidelobe if near else 0.0):
-                    earlier.append((bank, peak))
-        if not earlier:
-            break
-        accept(earlier)
-    return _first_paths(bursts, heard, covariances, noise, baseband, start_s, band, receiver)
+        accept([(bank, peak) for bank, peak in peaks if peak.power >= NEAR_STRONGEST * strongest])
+    if bursts:
+        settle(FULL_ITERATIONS)
+    return _first_paths(bursts, heard, covariances, noise, baseband, start_s, band, receiver, windows)
 
 
 def _first_paths(
@@ -212,12 +231,15 @@ def _first_paths(
     start_s: float,
     band: Band,
     receiver: str,
+    windows: Mapping[str, tuple[float, float]],
 ) -> list[tuple[Burst, Detection]]:
-    """Report each emitter by its first path, where the samples hold that whole."""
+    """Report each emitter by its first path of weight, where the samples hold that whole."""
     out = []
     for bank in {id(h.bank): h.bank for h in heard}.values():
         own = [i for i, h in enumerate(heard) if h.bank is bank]
-        first = min(own, key=lambda i: bursts[i].arrival_s)
+        strongest = max(abs(bursts[i].gain) ** 2 for i in own)
+        weighty = [i for i in own if abs(bursts[i].gain) ** 2 >= PATH_POWER * strongest]
+        first = min(weighty, key=lambda i: bursts[i].arrival_s)
         paths = tuple(
             Path(
                 bursts[i].arrival_s - bursts[first].arrival_s,
@@ -225,7 +247,7 @@ def _first_paths(
             )
             for i in own
         )
-        if _whole(bursts[first], baseband, start_s, band):
+        if _whole(bursts[first], baseband, start_s, band, windows[bank.emitter][0]):
             found = _detection(bursts[first], bank, receiver, covariances[first], float(noise[first]), band, paths)
             out.append((bursts[first], found))
     return out
@@ -239,10 +261,9 @@ def _search(
     start_s: float,
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction],
-    before_s: float,
+    known_s: list[float],
 ) -> Peak | None:
     opens_s, closes_s = windows[bank.emitter]
-    closes_s = min(closes_s, before_s)
     rates = None
     expected = predictions.get(bank.emitter)
     if expected is not None:
@@ -251,16 +272,18 @@ def _search(
         opens_s, closes_s = max(opens_s, begins_s - reach_s), min(closes_s, begins_s + reach_s)
         reach = 5 * expected.range_rate_sd_mps
         rates = (expected.range_rate_mps - reach, expected.range_rate_mps + reach)
-    return search(residual, start_s, bank, band, opens_s, closes_s, rates, plan.false_alarm_rate)
+    return search(residual, start_s, bank, band, opens_s, closes_s, rates, known_s, plan.false_alarm_rate)
 
 
-def _whole(burst: Burst, baseband: NDArray[np.complex128], start_s: float, band: Band) -> bool:
-    """Whether the samples hold the burst from its first chip to its last."""
+def _whole(burst: Burst, baseband: NDArray[np.complex128], start_s: float, band: Band, opens_s: float) -> bool:
+    """Whether the recording, which begins at 0, holds the burst from its first chip to its last.
+
+    Where the epoch began before the recording, an earlier path of a burst near its beginning may have been missed.
+    """
     half_s = burst.waveform.duration_s / 2
-    end_s = start_s + (len(baseband) - 1) / band.rate_hz
-    return (
-        burst.arrival_s - half_s >= start_s - 2 / band.rate_hz and burst.arrival_s + half_s <= end_s + 2 / band.rate_hz
-    )
+    end_s = start_s + len(baseband) / band.rate_hz
+    guard_s = min(half_s, 5e-3) if opens_s < 0 else 0.0
+    return burst.arrival_s - half_s >= max(start_s, guard_s) and burst.arrival_s + half_s <= end_s
 
 
 def _detection(

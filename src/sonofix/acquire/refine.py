@@ -148,7 +148,8 @@ def refine(
         right = (np.conj(jacobian) @ residual).real
         normal[kappa_rows, kappa_rows] += weight
         right[kappa_rows] -= weight * state[:, 2]
-        size = np.sqrt(np.diag(normal)) + 1e-300
+        size = np.sqrt(np.diag(normal))
+        size[size == 0] = 1.0
         scaled = normal / np.outer(size, size)
         scaled[np.diag_indices(len(scaled))] += damping + 1e-12
         step = (np.linalg.solve(scaled, right / size) / size).reshape(n_bursts, 5)[:, 2:]
@@ -172,7 +173,8 @@ def refine(
     jacobian = _jacobian(parts, gain)
     normal = (np.conj(jacobian) @ jacobian.T).real
     normal[kappa_rows, kappa_rows] += noise / (2 * kappa_sd**2)
-    size = np.sqrt(np.diag(normal)) + 1e-300
+    size = np.sqrt(np.diag(normal))
+    size[size == 0] = 1.0
     scaled = normal / np.outer(size, size)
     scaled[np.diag_indices(len(scaled))] += 1e-12
     spread = np.linalg.solve(scaled, np.eye(len(scaled))) / np.outer(size, size)

@@ -40,6 +40,7 @@ def search(
     opens_s: float,
     closes_s: float,
     rates: tuple[float, float] | None,
+    known_s: list[float],
     false_alarm_rate: float,
 ) -> Peak | None:
     """Find the highest correlation of one emitter's burst starting within [opens_s, closes_s].
@@ -52,6 +53,8 @@ def search(
         First sample at ``start_s``.
     rates : (low, high) in m/s or None
         Only range rates within; None: the whole bank.
+    known_s : list of float
+        Starts of paths already found; what stands within a correlation peak of them is their remainder.
     false_alarm_rate : float
         Probability that noise alone gives a detection in this search. Correlation power of noise is exponential, its
         mean is the median over ln 2, and the cells searched count as independent (they are fewer: conservative).
@@ -78,8 +81,12 @@ def search(
     spectrum = np.asarray(scipy.fft.fft(stretch, length))
     surface = scipy.fft.ifft(spectrum * bank.spectra(length, rows), axis=-1, overwrite_x=True)[:, :count]
     power = surface.real**2 + surface.imag**2
-    row, column = np.unravel_index(int(np.argmax(power)), power.shape)
     noise = float(np.median(power)) / np.log(2.0)
+    half = int(np.ceil(band.rate_hz / band.half_width_hz))
+    for known in known_s:
+        at = round((known - bank.lead_s - start_s) * band.rate_hz) - first
+        power[:, max(0, at - half) : max(0, at + half + 1)] = 0.0
+    row, column = np.unravel_index(int(np.argmax(power)), power.shape)
     threshold = float(np.log(power.size / false_alarm_rate))
     return Peak(
         start_s=start_s + (first + column) / band.rate_hz + bank.lead_s,

@@ -19,7 +19,10 @@ def speaker() -> Console:
     """Return a console on stdout that prints text as it is."""
     from rich.console import Console
 
-    return Console(highlight=False, markup=False, soft_wrap=True)
+    console = Console(highlight=False, markup=False, soft_wrap=True)
+    if not console.is_terminal:
+        console.width = 160  # a file or pipe has no edge at which a table should break
+    return console
 
 
 @contextmanager
@@ -45,16 +48,17 @@ def print_table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(
-        title=Text(title, style="bold"), title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False
-    )
-    table.add_column("")
+    heading = Text(title, style="bold")
+    table = Table(title=heading, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column("", no_wrap=True)
     for column in columns:
-        table.add_column(Text(column), justify="right")
+        table.add_column(Text(column), justify="right", no_wrap=True)
     for name, cells in rows.items():
         if any(cells):
             table.add_row(Text(name), *(Text(cell) for cell in cells))
-    speaker().print(table)
+    say = speaker()
+    say.print()
+    say.print(table)
 
 
 def length_text(length_m: float | None) -> str:

@@ -15,19 +15,21 @@ if TYPE_CHECKING:
 
 RATE_HZ = 192_000
 SNR_DB = 6.0
+PERIOD_S = 0.25
 
 _BEACONS = {
-    "B1": (0.4, 0.4, 3.4),
-    "B2": (4.3, 0.3, 3.1),
-    "B3": (8.1, 0.5, 3.5),
-    "B4": (11.6, 2.9, 3.2),
-    "B5": (11.5, 8.5, 3.4),
-    "B6": (7.4, 8.7, 3.0),
-    "B7": (3.2, 8.6, 3.5),
-    "B8": (0.3, 5.6, 3.2),
+    "B1": (0.9, 0.9, 3.4),
+    "B2": (4.3, 0.8, 3.1),
+    "B3": (8.1, 1.0, 3.5),
+    "B4": (11.3, 3.1, 3.2),
+    "B5": (11.2, 8.0, 3.4),
+    "B6": (7.4, 8.1, 3.0),
+    "B7": (3.2, 8.2, 3.5),
+    "B8": (0.8, 5.2, 3.2),
 }
 # Two aisles and a crossing: out along the south wall, back through the middle, home along the north.
-_WAY = ((1.5, 1.6), (10.3, 1.4), (10.6, 4.6), (5.6, 4.9), (5.2, 7.4), (1.6, 7.2), (1.5, 1.6))
+_WAY = ((1.9, 2.1), (9.8, 1.9), (10.0, 5.0), (5.9, 5.3), (5.6, 7.2), (2.0, 7.0), (1.9, 2.1))
+_CORNER_M = 1.2
 
 
 def demo(
@@ -83,7 +85,7 @@ def demo_site() -> Site:
     return Site.model_validate(
         {
             "site": {"name": "Demonstration hall", "bounds_m": [[0, 0, 0], [12, 9, 3.6]]},
-            "schedule": {"period_s": 0.5, "synchronised": True},
+            "schedule": {"period_s": PERIOD_S, "synchronised": True},
             "signal": {"carrier_hz": 40e3, "modulation": "ask", "cycles_per_chip": 10, "bandwidth_hz": 4e3},
             "vehicle": [{"id": "agv", "z_m": 0.0, "max_speed_mps": 2.0}],
             "beacon": [
@@ -100,8 +102,8 @@ def demo_motion(seconds: float) -> Motion:
     from sonofix.channel import Waypoints
 
     points = tuple((x, y, 0.0) for x, y in _WAY)
-    length_m = Waypoints(points, 1.0, radius_m=0.8).length_m
-    return Waypoints(points, min(max(length_m / seconds, 0.4), 1.5), radius_m=0.8)
+    length_m = Waypoints(points, 1.0, radius_m=_CORNER_M).length_m
+    return Waypoints(points, min(max(length_m / seconds, 0.4), 1.5), radius_m=_CORNER_M)
 
 
 def _check_folder(out: Path) -> None:

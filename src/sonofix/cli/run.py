@@ -130,8 +130,8 @@ class _Sample:
 
     def add(self, step: Step) -> None:
         """Show it the next step."""
-        place = self._count if self._count < self._most else int(self._rng.integers(self._count + 1))
-        if place == len(self._kept):
+        place = int(self._rng.integers(self._count + 1))
+        if self._count < self._most:
             self._kept.append((self._count, step))
         elif place < self._most:
             self._kept[place] = (self._count, step)

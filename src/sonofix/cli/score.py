@@ -71,7 +71,11 @@ def score_run(recording: Path, out: Path) -> Scored:
     ranges, track = read_ranges(out), read_track(out, site)
     # the speed matters only to say how long ago a moving beacon's sound left it: the simple formula is near enough
     speed = site.air.sound_speed_mps or float(air.sound_speed_linear_mps(site.air.temperature_c))
-    figures = {vehicle: score_track(truths[vehicle], rows) for vehicle, rows in track.items() if vehicle in truths}
+    figures = {
+        vehicle.id: score_track(truths[vehicle.id], track[vehicle.id])
+        for vehicle in site.vehicles
+        if vehicle.id in truths and vehicle.id in track
+    }
     return Scored(
         ranges=None if ranges is None else score_ranges(site, truths, ranges, speed),
         track={vehicle: found for vehicle, found in figures.items() if found is not None},

@@ -45,8 +45,9 @@ class Tally:
     def headline(self) -> str:
         """Return one line: epochs, time, ranges."""
         span_s = self._last_s - (self._first_s or 0.0)
+        span = f"{span_s:.1f}" if span_s < 100 else f"{span_s:.0f}"
         share = f" ({100 * self._used / self._heard:.0f} %)" if self._heard else ""
-        return f"{counted(self.epochs, 'epoch')} in {span_s:.3g} s, {self._used} of {self._heard} ranges used{share}"
+        return f"{counted(self.epochs, 'epoch')} in {span} s, {self._used} of {self._heard} ranges used{share}"
 
     def rows(self) -> dict[str, list[str]]:
         """Return the figures of each vehicle, by name."""

@@ -58,7 +58,7 @@ def draw_nodes(axes: Axes, beacons: Mapping[str, Floats], microphones: Mapping[s
             zorder=6,
         )
         heights = bool(np.any(at[:, 2] != 0)) and not crowd
-        for names, place in _clusters(nodes, 0.03 * size_m):
+        for names, place in _clusters(nodes, (0.05 if crowd else 0.03) * size_m):
             _label(axes, names, place, place[:2] - centre, colour, heights, 9 if crowd else 11)
 
 
@@ -89,12 +89,10 @@ def _label(
 
 
 def _clusters(nodes: Mapping[str, Floats], reach_m: float) -> list[tuple[list[str], Floats]]:
-    clusters: list[tuple[list[str], Floats]] = []
+    """Return chains of neighbours, each with its names and its middle; in the order of the first names."""
+    chains: list[dict[str, Floats]] = []
     for name, place in nodes.items():
-        for names, first in clusters:
-            if np.linalg.norm(place[:2] - first[:2]) < reach_m:
-                names.append(name)
-                break
-        else:
-            clusters.append(([name], place))
-    return clusters
+        near = [chain for chain in chains if min(np.linalg.norm(place[:2] - at[:2]) for at in chain.values()) < reach_m]
+        joined = {key: at for chain in near for key, at in chain.items()} | {name: place}
+        chains = [chain for chain in chains if not any(chain is other for other in near)] + [joined]
+    return [(list(chain), np.mean(list(chain.values()), axis=0)) for chain in chains]

@@ -24,6 +24,7 @@ def draw_plan(axes: Axes, recording: Recording, series: Series, truths: Mapping[
     in the legend where they would be too small to see; a vehicle that hardly moves is shown again, enlarged.
     """
     beacons, microphones = _places(recording)
+    standing = [*beacons.values(), *microphones.values()]
     sounding = {name: track.position_m[-1] for name, track in series.tracks.items()}
     size_m = _frame(axes, recording, series, truths, beacons | microphones)
     _floor(axes, recording)
@@ -32,7 +33,7 @@ def draw_plan(axes: Axes, recording: Recording, series: Series, truths: Mapping[
     vehicles = list(dict.fromkeys([*series.tracks, *series.fixes, *truths]))
     colours = dict(zip(vehicles, style.category_colours(len(vehicles)), strict=True))
     clock = Normalize(*_wide(series.span_s)) if len(vehicles) == 1 else None
-    zoom = open_zoom(axes, series, truths) if len(vehicles) == 1 else None
+    zoom = open_zoom(axes, series, truths, standing) if len(vehicles) == 1 else None
     enlarge = 1 if zoom else way.enlargement(list(series.tracks.values()), size_m)
     apart_m, most = 0.08 * size_m, max(18 // max(len(vehicles), 1), 5)
     for vehicle, colour in colours.items():
@@ -52,7 +53,7 @@ def draw_plan(axes: Axes, recording: Recording, series: Series, truths: Mapping[
         len(fix.time_s) for fix in series.fixes.values()
     ):
         _say_no_fix(axes, series)
-    scale_bar(axes, [*beacons.values(), *microphones.values()])
+    scale_bar(axes, standing)
     return _legend(series, truths, colours, clock is not None, enlarge, bool(beacons), bool(microphones))
 
 
@@ -84,15 +85,21 @@ def _frame(
 ) -> float:
     """Set the limits so that all fits, to scale, and fills the axes; return the larger side in m.
 
-    Of long tracks the outermost hundredth may leave the picture, so that a stray estimate does not shrink it.
+    Of long tracks the outermost hundredth may leave the picture; where the truth is known the frame is laid about it,
+    so that a stray estimate does not shrink the picture.
     """
     clouds = [np.array(list(nodes.values())).reshape(-1, 3)[:, :2]]
     clouds += [truth.position_m[:, :2] for truth in truths.values()]
-    for track in series.tracks.values():
-        xy = track.position_m[:, :2]
-        clouds.append(np.percentile(xy, (0.5, 99.5), axis=0) if len(xy) > 200 else xy)
     if recording.site.bounds_m is not None:
         clouds.append(np.asarray(recording.site.bounds_m, float)[:, :2])
+    known = np.concatenate(clouds)
+    for track in series.tracks.values():
+        xy = track.position_m[:, :2]
+        xy = np.percentile(xy, (1, 99), axis=0) if len(xy) > 200 else xy
+        if truths and np.ptp(known, axis=0).max() > 0:
+            slack = 0.1 * np.ptp(known, axis=0).max()
+            xy = np.clip(xy, known.min(axis=0) - slack, known.max(axis=0) + slack)
+        clouds.append(xy)
     points = np.concatenate(clouds)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -184,6 +191,8 @@ def _legend(
 
     if series.tracks and by_time:
         handles.append(Line2D([], [], color=middle, linewidth=3, label="track, coloured by time"))
+    elif len(series.tracks) > 8:
+        handles.append(Line2D([], [], color=style.INK, linewidth=3, label="tracks, coloured by vehicle"))
     elif series.tracks:
         handles += [Line2D([], [], color=colours[name], linewidth=3, label=name) for name in series.tracks]
     if any(np.isfinite(track.covariance_m2[:, 0, 0]).any() for track in series.tracks.values()):

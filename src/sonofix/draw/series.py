@@ -90,8 +90,8 @@ def gather(steps: Sequence[Step]) -> Series:
     moments += [float(t) for step in steps for t in step.ranges.time_s]
     moments += [estimate.time_s for of_vehicle in estimates.values() for estimate in of_vehicle]
     return Series(
-        tracks={vehicle: _track(rows) for vehicle, rows in estimates.items()},
-        fixes={vehicle: _fixes(rows) for vehicle, rows in fixes.items()},
+        tracks={vehicle: _track(estimates[vehicle]) for vehicle in sorted(estimates, key=_by_number)},
+        fixes={vehicle: _fixes(fixes[vehicle]) for vehicle in sorted(fixes, key=_by_number)},
         ranges=ranges,
         lanes=lanes,
         lane_kind=kind,

@@ -43,8 +43,8 @@ def draw_track(
             handles=handles,
             loc="lower left",
             bbox_to_anchor=(0.043, 0.006),
-            ncols=8,
-            fontsize=10,
+            ncols=max(len(handles), 1),
+            fontsize=10 if len(handles) <= 9 else 9,
             handletextpad=0.5,
             columnspacing=1.6,
         )
@@ -85,7 +85,7 @@ def _head(figure: Figure, series: Series, truths: Mapping[str, Truth], title: st
     figure.text(0.05, 0.948, title, fontsize=26, fontweight="bold", color=style.INK, va="center")
     span = series.span_s[1] - series.span_s[0]
     facts = [
-        f"{span:.1f} s" if span < 100 else f"{span:.0f} s",
+        *([f"{span:.1f} s" if span < 100 else f"{span:.0f} s"] if span > 0 else []),
         _counted(series.epoch_count, "epoch"),
         _counted(len(series.lanes), series.lane_kind),
         f"{len(series.ranges.time_s)} ranges",

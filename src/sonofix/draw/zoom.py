@@ -16,10 +16,10 @@ from sonofix.records import Floats, Truth
 _SMALL = 1 / 40
 
 
-def open_zoom(axes: Axes, series: Series, truths: Mapping[str, Truth]) -> Axes | None:
+def open_zoom(axes: Axes, series: Series, truths: Mapping[str, Truth], keep_clear: Iterable[Floats]) -> Axes | None:
     """Return an enlarged inset where all that happened fits in a fortieth of the picture, None elsewhere.
 
-    The inset stands beside the vehicle, on the side with more room, and is tied to it by two fine lines.
+    The inset stands where it covers as few of the given places as it can, near the vehicle, tied to it by fine lines.
     """
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     points = _inner(
@@ -41,12 +41,11 @@ def open_zoom(axes: Axes, series: Series, truths: Mapping[str, Truth]) -> Axes |
     half = max(1.15 * float(reach), 1e-4)
 
     place = (centre - low) / (high - low)
+    others = [(np.asarray(other, float)[:2] - low) / (high - low) for other in keep_clear]
     box = axes.get_window_extent()
-    wide, tall = 0.36, 0.36 * box.width / box.height
-    right = place[0] < 0.5
-    x = min(place[0] + 0.10, 0.86 - wide) if right else max(place[0] - 0.10 - wide, 0.14)
-    y = float(np.clip(place[1] - tall / 2, 0.20, 0.82 - tall))
-    inset = axes.inset_axes((float(x), y, wide, tall), zorder=20)
+    span = np.array([0.36, 0.36 * box.width / box.height])
+    corner = _free_corner(place, span, others)
+    inset = axes.inset_axes((corner[0], corner[1], span[0], span[1]), zorder=20)
     inset.set_xlim(centre[0] - half, centre[0] + half)
     inset.set_ylim(centre[1] - half, centre[1] + half)
     inset.set_facecolor(style.GROUND)
@@ -54,20 +53,38 @@ def open_zoom(axes: Axes, series: Series, truths: Mapping[str, Truth]) -> Axes |
     inset.tick_params(length=0, labelbottom=False, labelleft=False)
     for spine in inset.spines.values():
         spine.set_edgecolor(style.MUTED)
-    for corner in (0.0, 1.0):
+    away = (corner + span / 2 - place) / span
+    for k in (0.0, 1.0):
+        beside = abs(away[0]) >= abs(away[1])
+        side = 0.0 if away[0 if beside else 1] > 0 else 1.0
         axes.annotate(
             "",
             xy=(float(centre[0]), float(centre[1])),
-            xytext=(0.0 if right else 1.0, corner),
+            xytext=(side, k) if beside else (k, side),
             textcoords=inset.transAxes,
             arrowprops={"arrowstyle": "-", "color": style.MUTED, "lw": 0.9, "alpha": 0.7, "shrinkA": 0, "shrinkB": 8},
             zorder=7,
         )
-    factor = max(high - low) / (2 * half) * wide
+    factor = max(high - low) / (2 * half) * span[0]
     power = 10 ** max(0, int(np.floor(np.log10(max(factor, 1)))) - 1)
     words = f"enlarged {round(factor / power) * power:,} times".replace(",", "\u2009")
     inset.set_title(words, loc="left", color=style.MUTED, fontsize=10, pad=5)
     return inset
+
+
+def _free_corner(place: Floats, span: Floats, others: list[Floats]) -> Floats:
+    """Return the lower left corner, in shares of the axes, of a box that keeps clear of a place and most others."""
+    grid = [
+        np.array([x, y]) for x in np.linspace(0.05, 0.95 - span[0], 9) for y in np.linspace(0.09, 0.92 - span[1], 9)
+    ]
+
+    def cost(corner: Floats) -> float:
+        middle = corner + span / 2
+        covered = sum(bool((np.abs(other - middle) < span / 2 + 0.06).all()) for other in others)
+        gap = float(np.max(np.abs(place - middle) - span / 2))
+        return 3.0 * covered + (30.0 if gap < 0.06 else 0.0) + float(np.linalg.norm(place - middle))
+
+    return min(grid, key=cost)
 
 
 def _inner(clouds: Iterable[Floats]) -> Floats:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sonofix.files.problem import Problem, RecordingError
 
 CAPTURE_NAMES = ("capture.flac", "capture.wav")
+FORMATS = ("FLAC", "WAV", "WAVEX", "RF64", "W64")
 
 _UNKNOWN_COUNT = 2**62
 # A damaged FLAC loses the read call in which the damage lies: read little at a time.
@@ -126,6 +127,8 @@ def open_capture(path: Path) -> Capture:
             some = len(stream.read(1, dtype="float32", always_2d=True))
     except (soundfile.SoundFileError, OSError) as error:
         raise RecordingError([_unreadable(path, error)]) from None
+    if not kind.startswith(FORMATS):
+        raise RecordingError([Problem(name, "format", kind, "must be FLAC or WAV; export it again")])
     count = None if frames >= _UNKNOWN_COUNT else int(frames)
     stated, held = _wav_counts(path) if kind.startswith(("WAV", "RF64")) else (None, None)
     if not some:
@@ -150,18 +153,20 @@ def _unreadable(path: Path, error: Exception) -> Problem:
 
 
 def _wav_counts(path: Path) -> tuple[int | None, int | None]:
-    """Return how many frames a RIFF header states (None: unknown, as a recorder leaves it) and how many follow it."""
+    """Return how many frames a WAV's header states (None: unknown, as a recorder leaves it) and how many follow."""
     with path.open("rb") as file:
-        if file.read(4) != b"RIFF" or len(file.read(8)) < 8:
+        if file.read(4) not in (b"RIFF", b"RF64") or len(file.read(8)) < 8:
             return None, None
-        frame_bytes = 0
+        frame_bytes = long_size = 0
         while len(head := file.read(8)) == 8:
             kind, size = head[:4], struct.unpack("<I", head[4:])[0]
             if kind == b"fmt ":
                 frame_bytes = struct.unpack("<H", file.read(size)[12:14])[0]
+            elif kind == b"ds64":  # EBU Tech 3306: where RF64 keeps sizes beyond 32 bits
+                long_size = struct.unpack("<Q", file.read(size)[8:16])[0]
             elif kind == b"data":
                 follow = path.stat().st_size - file.tell()
-                stated = None if size in (0, 0xFFFFFFFF) else size
+                stated = {0: None, 0xFFFFFFFF: long_size or None}.get(size, size)
                 return (stated // frame_bytes if stated and frame_bytes else stated), follow // max(frame_bytes, 1)
             else:
                 file.seek(size + size % 2, 1)

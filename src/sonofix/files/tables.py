@@ -6,7 +6,6 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -254,22 +253,21 @@ def _known_ids(names: Mapping[str, Sequence[str]], lines: Sequence[int], site: S
 
 def _in_order(times: Floats, keys: Sequence[str] | None, lines: Sequence[int], layout: Layout, sheet: Sheet) -> None:
     """Tell where time goes backwards (or stands, where it must not) for one key."""
-    last: dict[str, float] = {}
-    for i, (time, key) in enumerate(zip(times.tolist(), keys or [""] * len(times), strict=True)):
-        before = last.get(key, -np.inf)
-        if time < before or (layout.strictly and time == before):
+    kinds, which = np.unique(np.array(keys or [""] * len(times)), return_inverse=True)
+    for kind, key in enumerate(kinds.tolist()):
+        rows = np.flatnonzero((which == kind) & ~np.isnan(times))
+        steps = np.diff(times[rows])
+        for i in np.flatnonzero((steps < 0) | (steps == 0 if layout.strictly else False)):
             whose = f" of {key}" if key else ""
-            remedy = f"the row{whose} before has {before!r}; time must not go backwards, so sort the rows"
-            if time == before:
+            remedy = f"the row{whose} before has {times[rows[i]]:.9g}; time must not go backwards, so sort the rows"
+            if steps[i] == 0:
                 remedy = "the row before has the same time; every epoch has one row"
-            sheet.tell(f"line {lines[i]}, {layout.order}", time, remedy)
-        if not np.isnan(time):
-            last[key] = time
+            sheet.tell(f"line {lines[rows[i + 1]]}, {layout.order}", float(times[rows[i + 1]]), remedy)
 
 
 def _sorted(columns: dict[str, Floats], names: dict[str, tuple[str, ...]], order: str | None) -> Table:
     """Return the rows of all vehicles in one order of time."""
-    if order and order in columns and any(b < a for a, b in pairwise(columns[order].tolist())):
+    if order and order in columns and np.any(np.diff(columns[order]) < 0):
         rows: NDArray[np.intp] = np.argsort(columns[order], kind="stable")
         columns = {name: values[rows] for name, values in columns.items()}
         names = {name: tuple(texts[i] for i in rows) for name, texts in names.items()}

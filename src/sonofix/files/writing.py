@@ -168,10 +168,15 @@ class _RowFile:
         self._count = 0
         with told(path.parent, path.name):
             self._file: TextIO = path.open("w", newline="", encoding="utf-8")
-            self._rows = csv.writer(self._file, delimiter=separator, lineterminator="\n")
+        self._rows = csv.writer(self._file, delimiter=separator, lineterminator="\n")
+        try:
             if header:
-                self._rows.writerow(header)
-                self._file.flush()
+                with told(path.parent, path.name):
+                    self._rows.writerow(header)
+                    self._file.flush()
+        except RecordingError:
+            self.abandon()
+            raise
 
     def add(self, rows: Iterable[tuple[float, list[str]]]) -> None:
         """Take rows with their times; equal times keep the order they came in."""
