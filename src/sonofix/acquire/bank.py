@@ -37,6 +37,8 @@ class Bank:
     replicas : complex64 (m, n)
         Unit energy, sampled at the base band's rate; sample 0 stands ``lead_s`` before the burst's start.
     lead_s : float
+    energy : float
+        Of the signature at unit gain, in base-band samples.
     """
 
     emitter: str
@@ -44,6 +46,7 @@ class Bank:
     range_rate_mps: Floats
     replicas: NDArray[np.complex64]
     lead_s: float
+    energy: float
 
     def spectra(self, length: int, rows: Sequence[int] | slice = slice(None)) -> NDArray[np.complex64]:
         """Conjugate spectra (m, length) of the replicas, ready to multiply with a spectrum of samples."""
@@ -85,4 +88,5 @@ def make_bank(emitter: str, waveform: Waveform, band: Band, max_rate_mps: float,
         values = sample(waveform.signature, waveform.rate_hz, waveform.start_s, tau)
         values *= np.exp(-2j * np.pi * waveform.carrier_hz * beta * u)
         replicas[row] = values / np.linalg.norm(values)
-    return Bank(emitter, waveform, rates, replicas, lead_s)
+    energy = float(np.sum(np.abs(waveform.signature) ** 2)) * band.rate_hz / waveform.rate_hz
+    return Bank(emitter, waveform, rates, replicas, lead_s, energy)

@@ -145,10 +145,11 @@ def acquire(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Heard:
-    """One path of one emitter's burst, as found: its correlation power when it was."""
+    """One path of one emitter's burst, as found: its correlation power then, and what it must show over the noise."""
 
     bank: Bank
     power: float
+    threshold: float
 
     @property
     def sounds_s(self) -> float:
@@ -179,7 +180,7 @@ def _take_apart(
         for bank, peak in found:
             beta = peak.range_rate_mps / plan.sound_speed_mps
             bursts.append(Burst(bank.waveform, peak.start_s + bank.waveform.duration_s / 2, beta, 0.0, 0j))
-            heard.append(_Heard(bank, peak.power))
+            heard.append(_Heard(bank, peak.power, peak.threshold))
         settle(ROUGH_ITERATIONS)
 
     def settle(iterations: int) -> None:
@@ -209,7 +210,7 @@ def _take_apart(
                 continue
             known_s = [b.arrival_s - bank.waveform.duration_s / 2 for b, _ in paths]
             peak = _search(plan, band, bank, residual, start_s, windows, predictions, known_s)
-            if peak is None or not peak.found:
+            if peak is None or peak.power < (peak.threshold if paths else peak.worth_trying) * peak.noise:
                 continue
             if peak.power > PATH_POWER * max((h.power for _, h in paths), default=0.0):
                 peaks.append((bank, peak))
@@ -217,8 +218,15 @@ def _take_apart(
             break
         strongest = max(peak.power for _, peak in peaks)
         accept([(bank, peak) for bank, peak in peaks if peak.power >= NEAR_STRONGEST * strongest])
-    if bursts:
+    while bursts:
+        # interference from paths not yet found is gone now: only what stands above the last noise was really heard
         settle(FULL_ITERATIONS)
+        power = np.array([abs(b.gain) ** 2 * h.bank.energy for b, h in zip(bursts, heard, strict=True)])
+        sure = power > np.array([h.threshold for h in heard]) * noise
+        if sure.all():
+            break
+        bursts = [b for b, keep in zip(bursts, sure, strict=True) if keep]
+        heard = [h for h, keep in zip(heard, sure, strict=True) if keep]
     return _first_paths(bursts, heard, covariances, noise, baseband, start_s, band, receiver, windows)
 
 

@@ -17,7 +17,8 @@ class Peak:
 
     ``start_s`` is when the burst's first chip is heard, recorder's clock; ``power`` the correlation power against the
     unit-energy replica; ``noise`` that of noise in the same search (mean, from its median); ``threshold`` what
-    ``power / noise`` must exceed.
+    ``power / noise`` must exceed once nothing else disturbs. Peaks above ``worth_trying``, which noise alone reaches in
+    one search of three, are tried: in echoes a true burst may not stand out until others are taken away.
     """
 
     start_s: float
@@ -25,11 +26,7 @@ class Peak:
     power: float
     noise: float
     threshold: float
-
-    @property
-    def found(self) -> bool:
-        """Whether the peak stands above the threshold."""
-        return self.power > self.threshold * self.noise
+    worth_trying: float
 
 
 def search(
@@ -94,4 +91,5 @@ def search(
         power=float(power[row, column]),
         noise=max(noise, 1e-30),
         threshold=threshold,
+        worth_trying=float(np.log(power.size)) + 1.0,
     )
