@@ -5,13 +5,12 @@ File, live and simulation run this.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix import air
 from sonofix.acquire.epochs import Schedule, Window, reach_s, screen
 from sonofix.acquire.plan import acquire, make_plan
 from sonofix.locate.fix import fix
@@ -29,6 +28,7 @@ from sonofix.records import (
     Table,
     Waveform,
 )
+from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, estimate, predict
 from sonofix.track.follow import Follower, expectations
@@ -40,25 +40,12 @@ THERMOMETER_SD_K = 1.0
 """What a computed sound speed rests on; a stated `sound_speed_mps` is taken as it is."""
 
 
-def sound_speed(site: Site) -> tuple[float, float]:
-    """Sound speed and its deviation, m/s: as stated, or Cramer 1993 from the site's air."""
-    if site.air.sound_speed_mps is not None:
-        return site.air.sound_speed_mps, 0.0
-    a = site.air
-    speed = float(air.sound_speed_mps(a.temperature_c, a.humidity, a.pressure_kpa))
-    return speed, 0.607 * THERMOMETER_SD_K
-
-
-def run(
-    recording: Recording, waveforms: Mapping[str, Waveform] | None = None, rate_hz: float | None = None
-) -> Iterator[Step]:
+def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
     """Run a recording through the whole street.
 
     Parameters
     ----------
     recording : Recording
-    waveforms : mapping from beacon id to Waveform
-        What the coded beacons send; not needed where the recording states ranges.
     rate_hz : float or None
         Estimates at this rate; None: one an epoch.
 
@@ -72,18 +59,44 @@ def run(
         If the recording holds neither samples nor ranges, or cannot be sampled at the site's carrier.
     """
     if recording.blocks is not None and recording.rate_hz is not None:
-        receiver = Receiver(
-            recording.site, recording.rate_hz, waveforms or {}, recording.sync_s, recording.tables.get("start"), rate_hz
-        )
-        for block in recording.blocks(int(recording.rate_hz)):
-            yield from receiver.feed(block)
-        yield from receiver.finish()
+        yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
     elif recording.ranges is not None:
         street = Street(recording.site, recording.tables.get("start"), rate_hz)
-        for epoch in stated_epochs(recording.ranges, sound_speed(recording.site)[0]):
+        for epoch in stated_epochs(recording.ranges, recording.site.sound_speed_mps):
             yield street.walk(epoch)
     else:
         raise ValueError("the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv")
+
+
+def _run_samples(
+    recording: Recording,
+    sample_rate_hz: float,
+    blocks: Callable[[int], Iterator[NDArray[np.float32]]],
+    rate_hz: float | None,
+) -> Iterator[Step]:
+    """Feed a receiver block by block; tell with the last step if the capture ended before its header says."""
+    site = recording.site
+    waveforms = waveforms_of(site, recording.references)
+    receiver = Receiver(site, sample_rate_hz, waveforms, recording.sync_s, recording.tables.get("start"), rate_hz)
+    count, last = 0, None
+
+    def steps() -> Iterator[Step]:
+        nonlocal count
+        for block in blocks(int(sample_rate_hz)):
+            count += len(block)
+            yield from receiver.feed(block)
+        yield from receiver.finish()
+
+    for step in steps():
+        if last is not None:
+            yield last
+        last = step
+    if last is None:
+        return
+    if recording.sample_count is not None and count < recording.sample_count:
+        text = f"the capture ends after {count} samples; its header states {recording.sample_count}"
+        last = replace(last, events=(*last.events, Event(count / sample_rate_hz, "", "truncated", text)))
+    yield last
 
 
 class Street:
@@ -179,7 +192,8 @@ class Receiver:
             raise ValueError("reading samples needs [schedule] period_s: state how often the beacons burst")
         self.site = site
         self.waveforms = waveforms
-        self.sound_speed_mps, self.sound_speed_sd_mps = sound_speed(site)
+        self.sound_speed_mps = site.sound_speed_mps
+        self.sound_speed_sd_mps = 0.0 if site.air.sound_speed_mps is not None else 0.607 * THERMOMETER_SD_K
         self._microphones = [m for m in site.microphones if m.channel is not None]
         if not self._microphones:
             raise ValueError("no [[microphone]] names a channel of the capture: add channel = 0, 1, …")

@@ -49,6 +49,14 @@ class Waveform:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ReferenceBurst:
+    """A recorded burst (the first seed's calibration): ``samples`` float64 (n,), full scale ±1."""
+
+    samples: Floats
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RangeRows:
     """Ranges that a recording states instead of samples; ``sd_m`` holds NaN where a row states none."""
 
@@ -88,6 +96,8 @@ class Recording:
     ranges : RangeRows or None
     tables : mapping from file stem ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings",
         "exchanges") to Table
+    references : mapping from beacon id to ReferenceBurst
+        Recorded bursts that the site's codes name.
     """
 
     site: Site
@@ -97,6 +107,7 @@ class Recording:
     sync_s: Floats | None = None
     ranges: RangeRows | None = None
     tables: Mapping[str, Table] = field(default_factory=dict)
+    references: Mapping[str, ReferenceBurst] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,8 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from sonofix import air
+
 # TOML tells numbers from text and from truth values, so nothing is converted except whole numbers to decimal ones.
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0)]
@@ -357,6 +359,14 @@ class Site(_Section):
     def bounds_m(self) -> tuple[Vector, Vector] | None:
         """Lower and upper corner of the room, in m."""
         return self.section.bounds_m
+
+    @property
+    def sound_speed_mps(self) -> float:
+        """Speed of sound as the site states it, else by Cramer 1993 for its air."""
+        stated = self.air.sound_speed_mps
+        if stated is not None:
+            return stated
+        return air.sound_speed_mps(self.air.temperature_c, self.air.humidity, self.air.pressure_kpa)
 
     @property
     def coded_beacons(self) -> tuple[Beacon, ...]:

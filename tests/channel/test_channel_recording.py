@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sonofix.channel import Circle, Line, Motion, Sampled, Still, Tone, simulate
 from sonofix.channel.simulate import PAGE
 from sonofix.records import Recording, Waveform
-from sonofix.signals.waveform import waveform_of
+from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
 
 RATE = 96e3
@@ -38,7 +38,7 @@ def _site(beacons: list[dict[str, Any]], microphones: list[dict[str, Any]], **ot
 
 
 def _waveforms(site: Site) -> dict[str, Waveform]:
-    return {b.id: waveform_of(site, b, SPEED) for b in site.coded_beacons}
+    return waveforms_of(site)
 
 
 def _samples(recording: Recording, length: int = 10_000) -> NDArray[np.float32]:

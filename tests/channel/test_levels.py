@@ -7,7 +7,7 @@ import pytest
 
 from sonofix.channel import Circle, Motion, Still, direct_gains, level_below, noise_for_snr, simulate
 from sonofix.records import Waveform
-from sonofix.signals.waveform import waveform_of
+from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
 
 SITE = Site.model_validate(
@@ -32,7 +32,7 @@ DRIVE: dict[str, Motion] = {"v": Circle((3.0, 2.5, 0.5), 1.0, 2.0)}
 
 
 def _waveforms() -> dict[str, Waveform]:
-    return {b.id: waveform_of(SITE, b) for b in SITE.beacons}
+    return waveforms_of(SITE)
 
 
 def test_gains_are_spreading_and_absorption() -> None:

@@ -19,7 +19,7 @@ from sonofix.cli.run import _Sample
 from sonofix.files import write_recording
 from sonofix.records import RangeEpoch, RangeRows, Recording, Step, Truth
 from sonofix.signals.codes import primitive_taps
-from sonofix.signals.waveform import waveform_of
+from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
 
 runner = CliRunner()
@@ -87,7 +87,7 @@ def test_ranges_in_everything_out(tmp_path):
 
 def test_samples_in_positions_out(tmp_path):
     site = Site.model_validate(hall())
-    waveforms = {beacon.id: waveform_of(site, beacon) for beacon in site.coded_beacons}
+    waveforms = waveforms_of(site)
     motions = {"agv": Line((2.0, 2.0, 0.0), (0.6, 0.3, 0.0))}
     noise = noise_for_snr(10.0, 0.1, direct_gains(site, motions, waveforms, 1.0), waveforms)
     recording, truth = simulate(

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 from sonofix.channel import Circle, Waypoints, simulate
 from sonofix.cli.main import app
 from sonofix.files import read_recording, read_site, read_truth
-from sonofix.signals.waveform import waveform_of
+from sonofix.signals.waveform import waveform_of, waveforms_of
 
 SITE = """format = 1
 [site]
@@ -82,7 +82,7 @@ def test_the_folder_holds_what_was_simulated(site: Path, tmp_path: Path) -> None
         {"agv": Circle((5.0, 4.0, 0.4), 1.5, 1.2)},
         rate_hz=96e3,
         duration_s=0.4,
-        waveforms={b.id: waveform_of(plan, b) for b in plan.beacons},
+        waveforms=waveforms_of(plan),
         noise_sd=0.01,
         level=0.5,
         absorption_db_per_m=0.5,

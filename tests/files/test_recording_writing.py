@@ -7,8 +7,7 @@ import pytest
 import soundfile
 
 from sonofix.files import RecordingError, read_recording, read_references, read_truth, write_recording
-from sonofix.records import RangeRows, Recording, Table, Truth
-from sonofix.signals.waveform import ReferenceBurst
+from sonofix.records import RangeRows, Recording, ReferenceBurst, Table, Truth
 from sonofix.site import Beacon, ChipsCode, Microphone, ReferenceCode, Schedule, Signal, Site, Vehicle
 
 RATE_HZ = 48000.0

@@ -52,7 +52,7 @@ class Bank:
         """Conjugate spectra (m, length) of the replicas, ready to multiply with a spectrum of samples."""
         import scipy.fft
 
-        return np.conj(scipy.fft.fft(self.replicas[rows], length, axis=-1)).astype(np.complex64)
+        return np.conj(np.asarray(scipy.fft.fft(self.replicas[rows], length, axis=-1))).astype(np.complex64)
 
 
 def velocity_step_mps(waveform: Waveform, sound_speed_mps: float) -> float:

@@ -139,7 +139,7 @@ def downconvert(samples: NDArray[np.float32], first_sample: int, band: Band) -> 
     step = band.carrier_hz / band.sample_rate_hz
     half = (taps - 1) // 2
     # the mixer sits inside the taps, centred; what is left is one rotation for each output sample
-    rotation = np.exp(-2j * np.pi * step * (np.arange(taps) - half))
+    rotation: NDArray[np.complex128] = np.exp(-2j * np.pi * step * (np.arange(taps) - half))
     _mix_filter(
         np.ascontiguousarray(samples, np.float32),
         (band.taps * rotation.real).astype(np.float32),

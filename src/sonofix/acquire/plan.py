@@ -265,7 +265,7 @@ def _search(
     plan: Plan,
     band: Band,
     bank: Bank,
-    residual: NDArray[np.complex128],
+    residual: NDArray[np.complexfloating],
     start_s: float,
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction],

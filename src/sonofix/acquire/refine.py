@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from sonofix.records import Floats, Waveform
 from sonofix.signals.interpolate import read, read_slope
 
+Complexes = NDArray[np.complexfloating]
+
 STEP_LIMIT = np.array([1e-4, 3e-4, 1e-1])
 """Of one iteration in arrival (s), β and κ (1/s)."""
 
@@ -86,14 +88,14 @@ def burst_columns(burst: Burst, start_s: float, rate_hz: float, count: int) -> N
 
 
 def refine(
-    baseband: NDArray[np.complex128],
+    baseband: Complexes,
     start_s: float,
     rate_hz: float,
     bursts: list[Burst],
     kappa_sd: float,
     whiteness: float,
     iterations: int = 12,
-) -> tuple[list[Burst], list[Floats], NDArray[np.complex128], Floats]:
+) -> tuple[list[Burst], list[Floats], Complexes, Floats]:
     """Gauss–Newton on all bursts at once, Levenberg-damped where a step does not lower the misfit.
 
     Parameters
@@ -119,12 +121,12 @@ def refine(
     state = np.array([[b.arrival_s, b.beta, b.kappa] for b in bursts])
     kappa_rows = 5 * np.arange(n_bursts) + 4
 
-    def evaluate(state: Floats) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.complex128]]:
+    def evaluate(state: Floats) -> tuple[Complexes, Complexes, Complexes]:
         """Model columns (n, 4, count), best gains (n,) and what they leave (count,)."""
         parts = np.stack(
             [
-                burst_columns(Burst(b.waveform, *state[i], 0j), start_s, rate_hz, count)  # pyright: ignore[reportArgumentType]
-                for i, b in enumerate(bursts)
+                burst_columns(_moved(burst, row, 0j), start_s, rate_hz, count)
+                for burst, row in zip(bursts, state, strict=True)
             ]
         )
         basis = parts[:, 0]
@@ -137,7 +139,7 @@ def refine(
     noise = _noise(residual, parts[:, 0], whiteness)
     weight = noise / (2 * kappa_sd**2)  # of κ² beside |residual|²
 
-    def misfit(residual: NDArray[np.complex128], state: Floats) -> float:
+    def misfit(residual: Complexes, state: Floats) -> float:
         return float(np.sum(np.abs(residual) ** 2) + np.sum(weight * state[:, 2] ** 2))
 
     cost = misfit(residual, state)
@@ -179,11 +181,16 @@ def refine(
     scaled[np.diag_indices(len(scaled))] += 1e-12
     spread = np.linalg.solve(scaled, np.eye(len(scaled))) / np.outer(size, size)
     covariances = [noise[i] / 2 * spread[5 * i + 2 : 5 * i + 4, 5 * i + 2 : 5 * i + 4] for i in range(n_bursts)]
-    refined = [Burst(b.waveform, *map(float, state[i]), complex(gain[i])) for i, b in enumerate(bursts)]  # pyright: ignore[reportArgumentType]
+    refined = [_moved(burst, row, complex(g)) for burst, row, g in zip(bursts, state, gain, strict=True)]
     return refined, covariances, residual, noise
 
 
-def _jacobian(parts: NDArray[np.complex128], gain: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def _moved(burst: Burst, row: Floats, gain: complex) -> Burst:
+    """Return a burst at another arrival, β and κ, of another gain."""
+    return Burst(burst.waveform, float(row[0]), float(row[1]), float(row[2]), gain)
+
+
+def _jacobian(parts: Complexes, gain: Complexes) -> Complexes:
     """Rows: for each burst real gain, imaginary gain, arrival, β, κ."""
     n_bursts, _, count = parts.shape
     jacobian = np.empty((n_bursts, 5, count), np.complex128)
@@ -193,7 +200,7 @@ def _jacobian(parts: NDArray[np.complex128], gain: NDArray[np.complex128]) -> ND
     return jacobian.reshape(5 * n_bursts, count)
 
 
-def _noise(residual: NDArray[np.complex128], models: NDArray[np.complex128], whiteness: float) -> Floats:
+def _noise(residual: Complexes, models: Complexes, whiteness: float) -> Floats:
     """White-equivalent residual power per sample where each burst sounds."""
     sounding = models != 0
     heard = np.maximum(np.sum(sounding, axis=1), 1)

@@ -30,7 +30,7 @@ class Peak:
 
 
 def search(
-    baseband: NDArray[np.complex128],
+    baseband: NDArray[np.complexfloating],
     start_s: float,
     bank: Bank,
     band: Band,
@@ -76,7 +76,9 @@ def search(
     stretch = baseband[first : last + bank.replicas.shape[1]].astype(np.complex64)
     length = int(scipy.fft.next_fast_len(len(stretch) + 1) or 0)
     spectrum = np.asarray(scipy.fft.fft(stretch, length))
-    surface = scipy.fft.ifft(spectrum * bank.spectra(length, rows), axis=-1, overwrite_x=True)[:, :count]
+    surface: NDArray[np.complex64] = np.asarray(
+        scipy.fft.ifft(spectrum * bank.spectra(length, rows), axis=-1, overwrite_x=True)
+    )[:, :count]
     power = surface.real**2 + surface.imag**2
     noise = float(np.median(power)) / np.log(2.0)
     half = int(np.ceil(band.rate_hz / band.half_width_hz))

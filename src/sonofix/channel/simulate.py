@@ -53,12 +53,6 @@ class _Scene:
     seed: int
 
 
-def sound_speed_of(site: Site) -> float:
-    """Speed of sound at a site, m/s: as it states, or Cramer's for its air."""
-    a = site.air
-    return a.sound_speed_mps or air.sound_speed_mps(a.temperature_c, a.humidity, a.pressure_kpa)
-
-
 def absorption_of(site: Site, carrier_hz: float) -> float:
     """Absorption of a site's air at a frequency, dB/m (ISO 9613-1)."""
     a = site.air
@@ -181,7 +175,7 @@ def simulate(
             b: absorption_of(site, w.carrier_hz) if absorption_db_per_m is None else absorption_db_per_m
             for b, w in waveforms.items()
         },
-        sound_speed_mps=sound_speed_mps or sound_speed_of(site),
+        sound_speed_mps=sound_speed_mps or site.sound_speed_mps,
         echo=echo,
         noise_sd=noise_sd,
         tone=tone,

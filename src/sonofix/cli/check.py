@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table as RichTable
 
     from sonofix.files.figures import CaptureFigures
-    from sonofix.records import Recording, Truth
-    from sonofix.signals.waveform import ReferenceBurst
+    from sonofix.records import Recording, ReferenceBurst, Truth
     from sonofix.site import Beacon, Microphone
 
 MOST_ROWS = 40
@@ -68,15 +67,13 @@ def check(
 def _site_lines(recording: Recording) -> Iterator[str]:
     from rich.markup import escape
 
-    from sonofix.files.oddities import sound_speed_mps
-
     site = recording.site
     yield f"[bold]{escape(site.name)}[/bold]"
     if site.bounds_m:
         size = [upper - lower for lower, upper in zip(*site.bounds_m, strict=True)]
         yield "Room: " + " x ".join(f"{length:g}" for length in size) + " m"
     why = "stated" if site.air.sound_speed_mps else f"air at {site.air.temperature_c:g} °C"
-    yield f"Sound speed: {sound_speed_mps(site):.2f} m/s ({why})"
+    yield f"Sound speed: {site.sound_speed_mps:.2f} m/s ({why})"
     if site.signal:
         s = site.signal
         chip = f", {s.cycles_per_chip:g} cycles a chip" if s.cycles_per_chip else ""

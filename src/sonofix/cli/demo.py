@@ -46,11 +46,11 @@ def demo(
     from sonofix import files
     from sonofix.channel import direct_gains, level_below, noise_for_snr, simulate
     from sonofix.cli.run import run_folder
-    from sonofix.signals.waveform import waveform_of
+    from sonofix.signals.waveform import waveforms_of
 
     site = demo_site()
     motions = {"agv": demo_motion(seconds)}
-    waveforms = {beacon.id: waveform_of(site, beacon) for beacon in site.coded_beacons}
+    waveforms = waveforms_of(site)
     gains = direct_gains(site, motions, waveforms, seconds)
     level = level_below(0.5, gains, waveforms)
     recording, truth = simulate(

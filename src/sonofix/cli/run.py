@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from sonofix.cli.tally import Tally
-    from sonofix.records import Recording, Step, Waveform
+    from sonofix.records import Recording, Step
 
 # A picture of more epochs than this looks the same, and would hold a long run in memory.
 _MOST_DRAWN = 5000
@@ -55,11 +55,10 @@ def run_folder(folder: Path, out: Path, plot: bool, rate_hz: float | None) -> No
     recording = files.read_recording(folder, to_run=True)
     truths = files.read_truth(folder)
     tally, sample = Tally(recording.site), _Sample(_MOST_DRAWN)
-    waveforms = _waveforms(folder, recording)
     try:
         with progress_bar() as bar:
             watched, on_step = _watched(recording, bar)
-            steps = flow.run(watched, waveforms, rate_hz)
+            steps = flow.run(watched, rate_hz)
             files.write_run(out, _seen(steps, tally.add, sample.add, on_step), recording.site)
     except KeyboardInterrupt:
         kept = f"{out} holds the first {counted(tally.epochs, 'epoch')}" if tally.epochs else "nothing was kept"
@@ -72,19 +71,6 @@ def run_folder(folder: Path, out: Path, plot: bool, rate_hz: float | None) -> No
     if plot:
         _draw(picture, recording, sample.steps(), truths)
     speaker().print(f"Written to {out}")
-
-
-def _waveforms(folder: Path, recording: Recording) -> dict[str, Waveform]:
-    """Return what the coded beacons send; nothing where the recording states ranges itself."""
-    if recording.blocks is None:
-        return {}
-    from sonofix import files, flow
-    from sonofix.signals.waveform import waveform_of
-
-    site = recording.site
-    speed, _ = flow.sound_speed(site)
-    references = files.read_references(folder, site)
-    return {beacon.id: waveform_of(site, beacon, speed, references.get(beacon.id)) for beacon in site.coded_beacons}
 
 
 def _watched(recording: Recording, bar: Progress) -> tuple[Recording, Callable[[Step], None]]:

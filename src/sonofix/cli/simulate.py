@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from sonofix.channel import Motion
-    from sonofix.records import Recording, Truth, Waveform
-    from sonofix.signals.waveform import ReferenceBurst
+    from sonofix.records import Recording, ReferenceBurst, Truth, Waveform
     from sonofix.site import Site
 
 MOTION_HELP = """How the vehicle moves; lengths in m, speeds in m/s. still:x,y · line:x,y,vx,vy · circle:cx,cy,r,speed
@@ -224,13 +223,11 @@ def _sampled(path: Path, z_m: float, site: Site, vehicle: str) -> Motion:
 
 
 def _waveforms(site: Site, references: Mapping[str, ReferenceBurst]) -> dict[str, Waveform]:
-    from sonofix.channel.simulate import sound_speed_of
-    from sonofix.signals.waveform import waveform_of
+    from sonofix.signals.waveform import waveforms_of
 
     if not site.coded_beacons:
         raise ValueError("site.toml: no beacon has a code, so none makes a sound; give one a code")
-    speed = sound_speed_of(site)
-    return {b.id: waveform_of(site, b, speed, references.get(b.id)) for b in site.coded_beacons}
+    return waveforms_of(site, references)
 
 
 def _made(

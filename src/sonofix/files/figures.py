@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.records import Recording
-from sonofix.signals.waveform import ReferenceBurst, chips_of
+from sonofix.records import Recording, ReferenceBurst
+from sonofix.signals.waveform import chips_of
 from sonofix.site import Beacon, ChirpCode, ReferenceCode, Site
 
 BLOCK = 65536

@@ -12,9 +12,8 @@ import numpy as np
 from sonofix import air
 from sonofix.files.figures import CaptureFigures, burst_s
 from sonofix.files.tables import LAYOUTS
-from sonofix.records import Floats, Recording
+from sonofix.records import Floats, Recording, ReferenceBurst
 from sonofix.signals import codes
-from sonofix.signals.waveform import ReferenceBurst
 from sonofix.site import Beacon, ChipsCode, Microphone, Site
 
 CLOSE_M = 0.05
@@ -115,7 +114,7 @@ def _schedule(site: Site, references: Mapping[str, ReferenceBurst]) -> Iterator[
     places = np.array([n.position_m for n in (*site.beacons, *site.microphones) if n.position_m is not None])
     corners = np.array(site.bounds_m) if site.bounds_m else places
     reach_m = float(np.linalg.norm(np.ptp(corners, axis=0))) if len(corners) else 0.0
-    travel_s = reach_m / sound_speed_mps(site)
+    travel_s = reach_m / site.sound_speed_mps
     lengths = {beacon.id: burst_s(site, beacon, references.get(beacon.id)) for beacon in site.coded_beacons}
     for beacon in site.coded_beacons:
         length_s = lengths[beacon.id]
@@ -199,11 +198,3 @@ def _sync(recording: Recording, figures: CaptureFigures) -> Iterator[str]:
         odd = np.count_nonzero(np.abs(steps - schedule.period_s) > 0.1 * schedule.period_s)
         if odd:
             yield f"{odd} of {len(steps)} steps between sync instants are not the period of {schedule.period_s:g} s"
-
-
-def sound_speed_mps(site: Site) -> float:
-    """Return the speed that the site states, or that its air has."""
-    stated = site.air.sound_speed_mps
-    if stated is not None:
-        return stated
-    return float(air.sound_speed_mps(site.air.temperature_c, site.air.humidity, site.air.pressure_kpa))

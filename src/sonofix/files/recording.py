@@ -9,13 +9,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from sonofix import air
 from sonofix.files.audio import Capture, find_capture, open_capture
 from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.site_file import FILE_NAME, read_site
 from sonofix.files.tables import LAYOUTS, read_table
-from sonofix.records import Floats, RangeRows, Recording, Table, Truth
-from sonofix.signals.waveform import ReferenceBurst
+from sonofix.records import Floats, RangeRows, Recording, ReferenceBurst, Table, Truth
 from sonofix.site import ChirpCode, ReferenceCode, Site
 
 SENSOR_FILES = ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings", "exchanges")
@@ -64,13 +62,14 @@ def read_recording(folder: str | Path, *, to_run: bool = False) -> Recording:
     }
     problems += _start_problems(tables.get("start"))
     ranges = None
+    references: dict[str, ReferenceBurst] = {}
     if site is not None:
         if "ranges" in tables:
             ranges = attempt(partial(_range_rows, tables["ranges"], site))
         if capture is not None:
             site = _with_period(site, tables.get("sync"))
             problems += _capture_problems(site, capture, "ranges" in tables)
-        attempt(lambda: read_references(folder, site))
+        references = attempt(lambda: read_references(folder, site)) or {}
         if to_run and not problems and capture is None and ranges is None:
             remedy = "nothing to compute positions from; add capture.wav, capture.flac or ranges.csv"
             problems.append(Problem(str(folder), "", None, remedy))
@@ -86,6 +85,7 @@ def read_recording(folder: str | Path, *, to_run: bool = False) -> Recording:
         sync_s=sync.columns["time_s"] if sync else None,
         ranges=ranges,
         tables=tables,
+        references=references,
     )
 
 
@@ -172,10 +172,7 @@ def _range_rows(table: Table, site: Site) -> RangeRows:
     if "range_m" in columns:
         range_m, column = columns["range_m"], "range_m"
     else:
-        speed = site.air.sound_speed_mps
-        if speed is None:
-            speed = float(air.sound_speed_mps(site.air.temperature_c, site.air.humidity, site.air.pressure_kpa))
-        range_m, column = columns["time_of_flight_s"] * speed, "time_of_flight_s"
+        range_m, column = columns["time_of_flight_s"] * site.sound_speed_mps, "time_of_flight_s"
     if site.schedule is None or site.schedule.synchronised:
         below = np.flatnonzero(range_m < 0)
         if len(below):

@@ -16,8 +16,7 @@ from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.site_file import FILE_NAME, site_text
 from sonofix.files.tables import LAYOUTS
 from sonofix.files.writing import told
-from sonofix.records import Floats, RangeRows, Recording, Table, Truth
-from sonofix.signals.waveform import ReferenceBurst
+from sonofix.records import Floats, RangeRows, Recording, ReferenceBurst, Table, Truth
 from sonofix.site import ReferenceCode
 
 BLOCK = 65536

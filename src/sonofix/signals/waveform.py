@@ -6,12 +6,12 @@ is the keyed envelope filtered by the product of their responses, computed on th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.records import Floats, Waveform
+from sonofix.records import Floats, ReferenceBurst, Waveform
 from sonofix.signals import codes
 from sonofix.site import (
     Beacon,
@@ -30,14 +30,6 @@ SAMPLES_PER_CHIP = 64
 
 REFERENCE_OVERSAMPLING = 16
 """Table samples for each sample of a recorded reference."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReferenceBurst:
-    """A recorded burst (the first seed's calibration): ``samples`` float64 (n,), full scale ±1."""
-
-    samples: Floats
-    rate_hz: float
 
 
 def chips_of(beacon: Beacon) -> NDArray[np.int8] | None:
@@ -153,9 +145,12 @@ def reference_waveform(
     return Waveform(envelope, envelope, rate_hz, start, signal.carrier_hz, duration_s)
 
 
-def waveform_of(
-    site: Site, beacon: Beacon, sound_speed_mps: float = 343.2, reference: ReferenceBurst | None = None
-) -> Waveform:
+def waveforms_of(site: Site, references: Mapping[str, ReferenceBurst] | None = None) -> dict[str, Waveform]:
+    """Return what each coded beacon of a site sends, by its id; recorded bursts come from ``references``."""
+    return {b.id: waveform_of(site, b, (references or {}).get(b.id)) for b in site.coded_beacons}
+
+
+def waveform_of(site: Site, beacon: Beacon, reference: ReferenceBurst | None = None) -> Waveform:
     """Return the burst of one beacon of a site.
 
     Raises
@@ -170,7 +165,7 @@ def waveform_of(
                 f"beacon {beacon.id}: its code is the recording {beacon.code.reference}, which was not given"
             )
         return reference_waveform(
-            reference, signal, sound_speed_mps, beacon.code.distance_m or 0.0, beacon.code.start_s or 0.0
+            reference, signal, site.sound_speed_mps, beacon.code.distance_m or 0.0, beacon.code.start_s or 0.0
         )
     if isinstance(beacon.code, ChirpCode):
         return chirp_waveform(beacon.code, signal)
