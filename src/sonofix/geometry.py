@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,21 +76,78 @@ def link(site: Site, emitters: tuple[str, ...], receivers: tuple[str, ...]) -> L
     return Links(emitter_vehicle, emitter_point, receiver_vehicle, receiver_point, sd)
 
 
-def _places(
-    vehicle: NDArray[np.int64], point: Floats, pose: Floats, dt: Floats
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Place, velocity, and their derivatives by yaw, of one end of each row at ``dt`` from the reference instant."""
-    state = np.where((vehicle >= 0)[:, None], pose[vehicle], 0.0)
-    yaw = state[:, 3] + state[:, 7] * dt
+@numba.njit(cache=True)
+def _place(vehicle, point, pose, at, dt, out):
+    """Place, velocity and their derivatives by yaw of one end of a row: rows 0 to 3 of ``out`` (4, 3)."""
+    out[:] = 0.0
+    if vehicle < 0:
+        out[0] = point
+        return
+    yaw_rate = pose[at, 7]
+    yaw = pose[at, 3] + yaw_rate * dt
     cos, sin = np.cos(yaw), np.sin(yaw)
-    mounted = (vehicle >= 0).astype(float)
-    x, y, z = point.T
-    arm = np.column_stack([cos * x - sin * y, sin * x + cos * y, z]) * mounted[:, None]
-    by_yaw = np.column_stack([-arm[:, 1], arm[:, 0], np.zeros(len(x))])
-    place = np.where(mounted[:, None] > 0, state[:, :3] + state[:, 4:7] * dt[:, None] + arm, point)
-    velocity = state[:, 4:7] + state[:, 7:8] * by_yaw
-    velocity_by_yaw = -state[:, 7:8] * np.column_stack([arm[:, 0], arm[:, 1], np.zeros(len(x))])
-    return place, velocity, by_yaw, velocity_by_yaw
+    east = cos * point[0] - sin * point[1]
+    north = sin * point[0] + cos * point[1]
+    for axis in range(3):
+        out[0, axis] = pose[at, axis] + pose[at, 4 + axis] * dt
+        out[1, axis] = pose[at, 4 + axis]
+    out[0, 0] += east
+    out[0, 1] += north
+    out[0, 2] += point[2]
+    out[2, 0], out[2, 1] = -north, east
+    out[1, 0] -= yaw_rate * north
+    out[1, 1] += yaw_rate * east
+    out[3, 0], out[3, 1] = -yaw_rate * east, -yaw_rate * north
+
+
+@numba.njit(cache=True)
+def _fill(
+    emitter_vehicle, emitter_point, receiver_vehicle, receiver_point, pose, dt, c, range_m, rate, by_range, by_rate
+):
+    """Fill what `model` returns, row by row."""
+    here, there = np.empty((4, 3)), np.empty((4, 3))
+    unit, across = np.empty(3), np.empty(3)
+    for i in range(len(dt)):
+        _place(receiver_vehicle[i], receiver_point[i], pose, receiver_vehicle[i], dt[i], here)
+        sent = dt[i]
+        distance = 0.0
+        for _ in range(4):  # contracts by v/c each time: 1e-9 of the range at 3 m/s
+            _place(emitter_vehicle[i], emitter_point[i], pose, emitter_vehicle[i], sent, there)
+            distance = np.sqrt(np.sum((here[0] - there[0]) ** 2))
+            sent = dt[i] - distance / c
+        distance = max(distance, 1e-6)
+        closing = 0.0
+        drag = 0.0
+        for axis in range(3):
+            unit[axis] = (here[0, axis] - there[0, axis]) / distance
+            closing += unit[axis] * (here[1, axis] - there[1, axis])
+            drag += unit[axis] * there[1, axis]
+        # how the range answers to its own delay: a moving emitter was elsewhere when it sent
+        lag = 1.0 / (1.0 - drag / c)
+        range_m[i] = distance
+        rate[i] = lag * closing
+        for axis in range(3):
+            across[axis] = (here[1, axis] - there[1, axis] - closing * unit[axis]) / distance
+        for end in range(2):
+            vehicle = receiver_vehicle[i] if end == 0 else emitter_vehicle[i]
+            if vehicle < 0:
+                continue
+            k = lag if end == 0 else -lag
+            when = dt[i] if end == 0 else sent
+            turned = here if end == 0 else there
+            turn = 0.0
+            rate_turn = 0.0
+            for axis in range(3):
+                turn += unit[axis] * turned[2, axis]
+                rate_turn += across[axis] * turned[2, axis] + unit[axis] * turned[3, axis]
+                by_range[i, vehicle, axis] += k * unit[axis]
+                by_range[i, vehicle, 4 + axis] += k * when * unit[axis]
+                by_rate[i, vehicle, axis] += k * across[axis]
+                by_rate[i, vehicle, 4 + axis] += k * (unit[axis] + when * across[axis])
+            by_range[i, vehicle, 3] += k * turn
+            by_range[i, vehicle, 7] += k * when * turn
+            by_rate[i, vehicle, 3] += k * rate_turn
+            by_rate[i, vehicle, 7] += k * (turn + when * rate_turn)
 
 
 def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -109,47 +167,11 @@ def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tup
     by_range, by_rate : float64 (n, vehicles, 8)
         Derivatives by ``pose``.
     """
-    receiver, receiver_v, receiver_by_yaw, receiver_v_by_yaw = _places(
-        links.receiver_vehicle, links.receiver_point, pose, dt
-    )
-    sent = dt
-    for _ in range(3):  # contracts by v/c each time; from 10 m and 3 m/s: 1e-7 m after three
-        emitter = _places(links.emitter_vehicle, links.emitter_point, pose, sent)[0]
-        sent = dt - np.sqrt(np.sum((receiver - emitter) ** 2, axis=1)) / sound_speed_mps
-    emitter, emitter_v, emitter_by_yaw, emitter_v_by_yaw = _places(
-        links.emitter_vehicle, links.emitter_point, pose, sent
-    )
-    away = receiver - emitter
-    range_m = np.sqrt(np.sum(away**2, axis=1))
-    safe = np.maximum(range_m, 1e-6)
-    unit = away / safe[:, None]
-    # how the range answers to its own delay: a moving emitter was elsewhere when it sent
-    lag = 1.0 / (1.0 - np.sum(unit * emitter_v, axis=1) / sound_speed_mps)
-    relative = receiver_v - emitter_v
-    rate = lag * np.sum(unit * relative, axis=1)
-    across = (relative - np.sum(unit * relative, axis=1)[:, None] * unit) / safe[:, None]
-    by_range = np.zeros((len(links), len(pose), 8))
-    by_rate = np.zeros_like(by_range)
-    row = np.arange(len(links))
-    for vehicle, sign, when, by_yaw, v_by_yaw in (
-        (links.receiver_vehicle, 1.0, dt, receiver_by_yaw, receiver_v_by_yaw),
-        (links.emitter_vehicle, -1.0, sent, emitter_by_yaw, emitter_v_by_yaw),
-    ):
-        on = vehicle >= 0
-        at, who = row[on], vehicle[on]
-        k = (sign * lag)[on]
-        u, t, a = unit[on], when[on], across[on]
-        turn, v_turn = by_yaw[on], v_by_yaw[on]
-        u_turn = np.sum(u * turn, axis=1)
-        rate_turn = np.sum(a * turn, axis=1) + np.sum(u * v_turn, axis=1)
-        by_range[at, who, :3] += k[:, None] * u
-        by_range[at, who, 3] += k * u_turn
-        by_range[at, who, 4:7] += (k * t)[:, None] * u
-        by_range[at, who, 7] += k * t * u_turn
-        by_rate[at, who, :3] += k[:, None] * a
-        by_rate[at, who, 3] += k * rate_turn
-        by_rate[at, who, 4:7] += k[:, None] * (u + t[:, None] * a)
-        by_rate[at, who, 7] += k * (u_turn + t * rate_turn)
+    n = len(links)
+    range_m, rate = np.empty(n), np.empty(n)
+    by_range, by_rate = np.zeros((n, len(pose), 8)), np.zeros((n, len(pose), 8))
+    ends = (links.emitter_vehicle, links.emitter_point, links.receiver_vehicle, links.receiver_point)
+    _fill(*ends, np.ascontiguousarray(pose), dt, sound_speed_mps, range_m, rate, by_range, by_rate)
     return range_m, rate, by_range, by_rate
 
 

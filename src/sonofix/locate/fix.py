@@ -208,18 +208,21 @@ def _exclude(solver: _Rows, rows: NDArray[np.int64], found: list[Solution]) -> t
         dof = solver.count(rows) - best.jacobian.shape[1]
         if dof <= 0 or best.chi2 <= _chi2_limit(dof) or len(rows) <= solver.needed + 1:
             return rows, found
-        trials = []
+        trials: list[tuple[float, NDArray[np.int64]]] = []
         for i in range(len(rows)):
             fewer = np.delete(rows, i)
-            again = solver.candidates(fewer)
-            if again:
-                trials.append((again[0].chi2 / max(1, solver.count(fewer) - best.jacobian.shape[1]), fewer, again))
+            try:
+                again = solve(solver.problem(fewer), best.pose, best.clock_m)
+            except np.linalg.LinAlgError:
+                continue
+            trials.append((again.chi2 / max(1, solver.count(fewer) - best.jacobian.shape[1]), fewer))
         if not trials:
             return rows, found
-        trials.sort(key=lambda t: t[0])
-        if trials[0][0] > 0.5 * best.chi2 / dof:
+        mended, fewer = min(trials, key=lambda trial: trial[0])
+        again = solver.candidates(fewer)
+        if mended > 0.5 * best.chi2 / dof or not again:
             return rows, found
-        _, rows, found = trials[0]
+        rows, found = fewer, again
 
 
 def _tell_apart(best: Solution, rivals: list[Solution], site: Site) -> tuple[Solution, Solution | None, bool]:

@@ -17,6 +17,9 @@ from sonofix.track.update import update
 PATIENCE = 3
 """Epochs in which most rows are refused before the track is put where the ranges say."""
 
+DOUBT_RATE = 0.05
+"""How fast the variance of stated ranges is scaled, per range."""
+
 GATHER_S = 5.0
 """Where single epochs are too poor for a fix, ranges of this long are gathered for one."""
 
@@ -41,6 +44,7 @@ class Follower:
         self._heard = np.zeros(len(site.vehicles), bool)
         self._recent: list[RangeEpoch] = []
         self._lag_s = 0.0
+        self._doubt = 1.0
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
         """Place a vehicle at a pose known beforehand."""
@@ -69,8 +73,14 @@ class Follower:
                 candidates &= found.used | np.isnan(found.residual_m)
         self._clock(epoch, links, fixes)
         self._gather(epoch)
-        self._place(links, fixes, events)
-        self.belief, used = update(self.belief, epoch, links, candidates)
+        taken = self._place(links, fixes, events)
+        stated = epoch.snr_db is None
+        asked = replace(epoch, covariance_m2=self._doubt * epoch.covariance_m2) if stated else epoch
+        # ranges that placed a vehicle have had their say
+        self.belief, used, surprise = update(self.belief, asked, links, candidates & ~taken)
+        used |= taken
+        if stated:
+            self._learn(surprise)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
@@ -104,12 +114,22 @@ class Follower:
         free[-2:] = [True, False]
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
 
+    def _learn(self, surprise: Floats) -> None:
+        """Scale the variance that stated ranges claim until their innovations agree with it.
+
+        Ranges stated by others come with rough deviations or none, and with errors that no deviation tells of.
+        """
+        for value in surprise:
+            self._doubt *= float(np.exp(DOUBT_RATE * (min(value, 9.0) - 1.0)))
+        self._doubt = float(np.clip(self._doubt, 1.0, 1e4))
+
     def _gather(self, epoch: RangeEpoch) -> None:
         if len(epoch):
             self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
 
-    def _place(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> None:
-        """Give positions to vehicles that have none, or whose track refuses what is heard."""
+    def _place(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> NDArray[np.bool_]:
+        """Give positions to vehicles that have none, or whose track refuses what is heard; return the rows that did."""
+        taken = np.zeros(len(links), bool)
         for who, found in enumerate(fixes):
             lost = self._refused[who] >= PATIENCE
             if self.belief.placed[who] and not lost:
@@ -122,9 +142,11 @@ class Follower:
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
             self.belief = predict(place(aged, who, start), self.belief.time_s, self.motion)
             self._refused[who] = 0
+            taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
             events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
+        return taken
 
     def _gathered(self, vehicle: str) -> Fix:
         """Return a fix from the latest range of each pair within some seconds."""

@@ -21,7 +21,7 @@ GATE_SIGMA = 5.0
 
 def update(
     belief: Belief, epoch: RangeEpoch, links: Links, candidates: NDArray[np.bool_], iterations: int = 4
-) -> tuple[Belief, NDArray[np.bool_]]:
+) -> tuple[Belief, NDArray[np.bool_], Floats]:
     """Correct a belief, already predicted to the epoch's instant, by the epoch's rows.
 
     Parameters
@@ -33,25 +33,28 @@ def update(
     -------
     belief : Belief
     used : bool (n,)
+    surprise : float64 (m,)
+        Of the m rows asked: squared range innovation over its expected variance, 1 on average where that is true.
     """
     used = np.zeros(len(epoch), bool)
     placed = np.append(belief.placed, True)
     rows = np.flatnonzero(candidates & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
     if epoch.clock == "common" and not belief.free[-2]:
-        return belief, used
+        return belief, used, np.zeros(0)
     if not len(rows):
-        return belief, used
+        return belief, used, np.zeros(0)
     dt = epoch.time_s[rows] - belief.time_s
     noise = row_noise(epoch, links, rows, dt)
     miss, derivative = _misfit(belief.mean, epoch, links.rows(rows), rows, dt)
     spread = np.einsum("ij,jk,ik->i", derivative, belief.covariance, derivative)
     n = len(rows)
-    near = np.abs(miss[:n]) <= GATE_SIGMA * np.sqrt(spread[:n] + np.diag(noise[0]))
+    surprise = miss[:n] ** 2 / (spread[:n] + np.diag(noise[0]))
+    near = surprise <= GATE_SIGMA**2
     if noise[1] is not None:
         near &= np.abs(miss[n:]) <= GATE_SIGMA * np.sqrt(spread[n:] + noise[1])
     rows, dt = rows[near], dt[near]
     if not len(rows):
-        return belief, used
+        return belief, used, surprise
     used[rows] = True
     covariance_r, rates = row_noise(epoch, links, rows, dt)
     n = len(rows)
@@ -75,7 +78,7 @@ def update(
             break
     keep = np.eye(len(mean)) - gain @ derivative
     covariance = keep @ belief.covariance @ keep.T + gain @ noise_all @ gain.T
-    return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2), used
+    return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2), used, surprise
 
 
 def _misfit(
