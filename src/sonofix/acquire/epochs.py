@@ -13,6 +13,9 @@ from sonofix.site import Site
 CLIPPED = 0.9995
 """Of full scale: at or above, a sample counts as clipped."""
 
+START_GUARD_S = 5e-3
+"""Bursts that begin this soon after an unsynchronised recording may hide a first path that came before it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -93,11 +96,11 @@ class Schedule:
         order = np.sort(starts_s)
         gaps = np.diff(np.append(order, order[0] + self._period_s))
         after = (int(np.argmax(gaps)) + 1) % len(order)
-        # the window may have opened amid the bursts of an epoch: begin with the first that can be whole
-        periods = np.floor(order[after] / self._period_s)
-        self._first_s = float(order[after] - periods * self._period_s)
-        if self._seek_s > 0.0:
-            self._first_s = float(order[after])
+        first_s = float(order[after])
+        if self._seek_s == 0.0:
+            # the window may have opened amid the bursts of an epoch: begin with the first that is whole
+            first_s = float((first_s - START_GUARD_S) % self._period_s + START_GUARD_S)
+        self._first_s = first_s
         self._base_s = self._first_s - self._reach_s
 
     def done(self, starts_s: Floats) -> None:

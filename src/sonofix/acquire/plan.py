@@ -145,11 +145,16 @@ def acquire(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Heard:
-    """One path of one emitter's burst, as found: its correlation power then, and what it must show over the noise."""
+    """One path of one emitter's burst, as found.
+
+    ``power`` is its correlation power then, ``clear`` whether that stood above the threshold at once; if not, it must
+    stand ``threshold`` times above the noise when all else is taken away.
+    """
 
     bank: Bank
     power: float
     threshold: float
+    clear: bool
 
     @property
     def sounds_s(self) -> float:
@@ -180,7 +185,7 @@ def _take_apart(
         for bank, peak in found:
             beta = peak.range_rate_mps / plan.sound_speed_mps
             bursts.append(Burst(bank.waveform, peak.start_s + bank.waveform.duration_s / 2, beta, 0.0, 0j))
-            heard.append(_Heard(bank, peak.power, peak.threshold))
+            heard.append(_Heard(bank, peak.power, peak.threshold, peak.power > peak.threshold * peak.noise))
         settle(ROUGH_ITERATIONS)
 
     def settle(iterations: int) -> None:
@@ -222,7 +227,7 @@ def _take_apart(
         # interference from paths not yet found is gone now: only what stands above the last noise was really heard
         settle(FULL_ITERATIONS)
         power = np.array([abs(b.gain) ** 2 * h.bank.energy for b, h in zip(bursts, heard, strict=True)])
-        sure = power > np.array([h.threshold for h in heard]) * noise
+        sure = power > np.array([0.0 if h.clear else h.threshold for h in heard]) * noise
         if sure.all():
             break
         bursts = [b for b, keep in zip(bursts, sure, strict=True) if keep]

@@ -69,6 +69,28 @@ def columns(
     return out
 
 
+@numba.njit(cache=True, fastmath=True)
+def gram(rows: Floats) -> Floats:
+    """``rows @ rows.T`` in blocks that stay in the cache.
+
+    A threaded matrix product of this size spends its time waiting for threads as soon as the machine does other work.
+    """
+    count, length = rows.shape
+    out = np.zeros((count, count))
+    for begin in range(0, length, 512):
+        end = min(begin + 512, length)
+        for i in range(count):
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(begin, end):
+                    total += rows[i, k] * rows[j, k]
+                out[i, j] += total
+    for i in range(count):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out
+
+
 def burst_columns(burst: Burst, start_s: float, rate_hz: float, count: int) -> NDArray[np.complex128]:
     """`columns` of a burst."""
     w = burst.waveform
@@ -130,10 +152,10 @@ def refine(
             ]
         )
         basis = parts[:, 0]
-        gram = np.conj(basis) @ basis.T
-        gram[np.diag_indices(n_bursts)] += 1e-9 * np.trace(gram).real / n_bursts + 1e-300
-        gain = np.linalg.solve(gram, np.conj(basis) @ baseband)
-        return parts, gain, baseband - gain @ basis
+        normal = np.einsum("in,jn->ij", np.conj(basis), basis)
+        normal[np.diag_indices(n_bursts)] += 1e-9 * np.trace(normal).real / n_bursts + 1e-300
+        gain = np.linalg.solve(normal, np.einsum("in,n->i", np.conj(basis), baseband))
+        return parts, gain, baseband - np.einsum("i,in->n", gain, basis)
 
     parts, gain, residual = evaluate(state)
     noise = _noise(residual, parts[:, 0], whiteness)
@@ -146,8 +168,8 @@ def refine(
     damping = 0.0
     for _ in range(iterations):
         jacobian = _jacobian(parts, gain)
-        normal = (np.conj(jacobian) @ jacobian.T).real
-        right = (np.conj(jacobian) @ residual).real
+        normal = np.asarray(gram(jacobian))
+        right = np.einsum("in,n->i", jacobian, _plain(residual))
         normal[kappa_rows, kappa_rows] += weight
         right[kappa_rows] -= weight * state[:, 2]
         size = np.sqrt(np.diag(normal))
@@ -173,7 +195,7 @@ def refine(
             break
     noise = _noise(residual, parts[:, 0], whiteness)
     jacobian = _jacobian(parts, gain)
-    normal = (np.conj(jacobian) @ jacobian.T).real
+    normal = np.asarray(gram(jacobian))
     normal[kappa_rows, kappa_rows] += noise / (2 * kappa_sd**2)
     size = np.sqrt(np.diag(normal))
     size[size == 0] = 1.0
@@ -190,14 +212,19 @@ def _moved(burst: Burst, row: Floats, gain: complex) -> Burst:
     return Burst(burst.waveform, float(row[0]), float(row[1]), float(row[2]), gain)
 
 
-def _jacobian(parts: Complexes, gain: Complexes) -> Complexes:
-    """Rows: for each burst real gain, imaginary gain, arrival, β, κ."""
+def _plain(values: Complexes) -> Floats:
+    """Complex values as real and imaginary parts in turn: Re(aᴴ b) becomes a plain product."""
+    return np.ascontiguousarray(values).view(np.float64)
+
+
+def _jacobian(parts: Complexes, gain: Complexes) -> Floats:
+    """Rows: for each burst real gain, imaginary gain, arrival, β, κ; columns as `_plain`."""
     n_bursts, _, count = parts.shape
     jacobian = np.empty((n_bursts, 5, count), np.complex128)
     jacobian[:, 0] = parts[:, 0]
     jacobian[:, 1] = 1j * parts[:, 0]
     jacobian[:, 2:] = parts[:, 1:] * gain[:, None, None]
-    return jacobian.reshape(5 * n_bursts, count)
+    return _plain(jacobian.reshape(5 * n_bursts, count))
 
 
 def _noise(residual: Complexes, models: Complexes, whiteness: float) -> Floats:

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE, Links, link, row_times
-from sonofix.locate.noise import row_noise
-from sonofix.locate.solve import Problem, Solution, solve
-from sonofix.locate.start import starts
+from sonofix.geometry import POSE, link, row_times
+from sonofix.locate.exclude import agrees, exclude
+from sonofix.locate.rows import Rows
+from sonofix.locate.solve import Problem, Solution, invert, solve
 from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
-FALSE_ALARM = 1e-5
-"""Of the χ² test, per epoch."""
+FLAT_M = 0.01
+"""Two heights alike to every range within this are one position with an open height."""
 
 AMBIGUOUS_CHI2 = 16.0
 """Two solutions whose χ² differ by less are both believed: odds of e⁸ to one."""
@@ -50,33 +50,37 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         # flights are not known, only their differences: the earliest arrival stands in
         time_s = float(np.mean(epoch.time_s[rows]))
     level_m = site.vehicle(vehicle).z_m
-    solver = _Rows(epoch, links, rows, time_s, level_m)
+    solver = Rows(epoch, links, rows, time_s, level_m)
     if len(rows) < solver.needed:
         text = f"{len(rows)} of {solver.needed} ranges; bring more beacons in reach or state what is known (z_m)"
         return _failed(epoch, vehicle, time_s, "too-few", text)
     found = solver.candidates(rows)
     if not found:
         return _failed(epoch, vehicle, time_s, "no-convergence", "no position fits; check beacon positions and units")
-    kept, found = _exclude(solver, rows, found)
+    kept, found, isolated = exclude(solver, rows, found)
     best = found[0]
     status: FixStatus = "ok"
     remedy = ""
-    dof = solver.count(kept) - best.jacobian.shape[1]
     inflation = 1.0
-    if dof > 0 and best.chi2 > _chi2_limit(dof):
-        status, inflation = "inconsistent", best.chi2 / dof
+    if not agrees(solver, kept, best):
+        status, inflation = "inconsistent", best.chi2 / (solver.count(kept) - best.jacobian.shape[1])
         remedy = "ranges disagree and no single one explains it; check beacon positions, sound speed and echoes"
+    elif not isolated:
+        status = "inconsistent"
+        remedy = "a range is wrong, but which cannot be told; bring more beacons in reach"
     rivals = [s for s in found[1:] if s.chi2 < best.chi2 + AMBIGUOUS_CHI2 * inflation]
-    best, mirror, undecided = _tell_apart(best, rivals, site)
+    best, mirror, undecided = _tell_apart(best, rivals, site, float(np.median(epoch.range_m[kept])))
     if undecided:
         text = "two mirror positions fit alike; state the room's bounds_m or the vehicle's z_m, or raise one beacon"
         return replace(
             _failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=None if mirror is None else mirror.pose[:3]
         )
-    covariance = _invert(best.jacobian)
-    if covariance is None:
+    covariance = invert(best.jacobian)
+    if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
         text = "the beacons in reach leave a direction open; spread them off one line or plane"
         return _failed(epoch, vehicle, time_s, "no-convergence", text)
+    if mirror is not None and site.bounds_m is None:
+        best, covariance = _between(best, mirror, covariance, solver)
     states = tuple(np.array(POSE)[solver.free]) + (("clock",) if solver.clock else ())
     hdop, vdop = solver.dop(kept, best)
     used = np.zeros(len(epoch), bool)
@@ -106,131 +110,19 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
     )
 
 
-class _Rows:
-    """Rows of one vehicle in one epoch, ready to be solved in any selection."""
+def _tell_apart(
+    best: Solution, rivals: list[Solution], site: Site, range_m: float
+) -> tuple[Solution, Solution | None, bool]:
+    """Choose among solutions that fit alike by the room's bounds; say so where that does not decide.
 
-    def __init__(
-        self, epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], time_s: float, level_m: float | None
-    ) -> None:
-        self.epoch, self.links, self.level_m = epoch, links, level_m
-        self.dt = epoch.time_s - time_s
-        self.clock = epoch.clock == "common"
-        self.rates = epoch.range_rate_mps is not None
-        mounted = links.receiver_vehicle[rows] >= 0
-        arms = np.where(mounted[:, None], links.receiver_point[rows], links.emitter_point[rows])
-        flat = arms[:, :2] - arms[:1, :2]
-        self.sounding = bool(len(rows)) and not mounted.all()
-        self.arm = arms.mean(axis=0) if len(rows) else np.zeros(3)
-        turns = bool(len(rows)) and bool(np.any(np.hypot(flat[:, 0], flat[:, 1]) > 1e-3))
-        self.free = np.array([True, True, level_m is None, turns] + [False] * 4)
-        if self.rates:
-            self.free[4:] = [True, True, level_m is None, turns]
-        # two ends on one body fix the heading; a lone one off the axis leaves its origin open by its arm
-        self.open_arm_m = 0.0 if turns else float(np.hypot(*self.arm[:2]))
-        self.needed = int(self.free[:4].sum()) + self.clock
-        here = links
-        self.as_first = Links(
-            np.where(here.emitter_vehicle >= 0, 0, -1),
-            here.emitter_point - self._unseen(here.emitter_vehicle),
-            np.where(here.receiver_vehicle >= 0, 0, -1),
-            here.receiver_point - self._unseen(here.receiver_vehicle),
-            here.emitter_sd_m,
-        )
-
-    def _unseen(self, vehicle: NDArray[np.int64]) -> Floats:
-        """Part of mounted lever arms that no heading places: solved for at the arm's own point."""
-        arm = np.array([self.arm[0], self.arm[1], 0.0]) if self.open_arm_m else np.zeros(3)
-        return np.where((vehicle >= 0)[:, None], arm, 0.0)
-
-    def count(self, rows: NDArray[np.int64]) -> int:
-        return len(rows) * (2 if self.rates else 1)
-
-    def problem(self, rows: NDArray[np.int64]) -> Problem:
-        epoch, dt = self.epoch, self.dt[rows]
-        covariance, rate_variance = row_noise(epoch, self.links, rows, dt)
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-        rate = None
-        if epoch.range_rate_mps is not None and rate_variance is not None:
-            rate = epoch.range_rate_mps[rows]
-            n = len(rows)
-            both = np.zeros((2 * n, 2 * n))
-            both[:n, :n] = whiten
-            both[n:, n:] = np.diag(rate_variance**-0.5)
-            whiten = both
-        return Problem(
-            self.as_first.rows(rows),
-            epoch.range_m[rows],
-            rate,
-            dt,
-            whiten,
-            self.free,
-            self.clock,
-            epoch.sound_speed_mps,
-        )
-
-    def candidates(self, rows: NDArray[np.int64]) -> list[Solution]:
-        """Solutions from all starts, best first, none twice."""
-        links = self.as_first.rows(rows)
-        fixed_ends = np.where((links.emitter_vehicle < 0)[:, None], links.emitter_point, links.receiver_point)
-        arms = np.where((links.emitter_vehicle < 0)[:, None], links.receiver_point, links.emitter_point)
-        anchors = fixed_ends - arms * np.array([0.0, 0.0, 1.0])
-        problem = self.problem(rows)
-        out: list[Solution] = []
-        for begin in starts(anchors, problem.range_m, self.level_m, self.clock):
-            for yaw in (0.0, 1.6, 3.1, -1.6) if self.free[3] else (0.0,):
-                pose = np.zeros(8)
-                pose[:3], pose[3] = begin[:3], yaw
-                try:
-                    found = solve(problem, pose, float(begin[3]))
-                except np.linalg.LinAlgError:
-                    continue
-                if found.converged and not any(np.linalg.norm(found.pose[:3] - s.pose[:3]) < 0.01 for s in out):
-                    out.append(found)
-        return sorted(out, key=lambda s: s.chi2)
-
-    def dop(self, rows: NDArray[np.int64], solution: Solution) -> tuple[float | None, float | None]:
-        """Horizontal and vertical dilution of precision: of ranges alone, unit variances."""
-        problem = self.problem(rows)
-        free = self.free.copy()
-        free[4:] = False
-        plain = replace(problem, rate_mps=None, whiten=np.eye(len(rows)), free=free)
-        covariance = _invert(solve(plain, solution.pose, solution.clock_m, iterations=1).jacobian)
-        if covariance is None:
-            return None, None
-        vertical = float(np.sqrt(covariance[2, 2])) if free[2] else None
-        return float(np.sqrt(covariance[0, 0] + covariance[1, 1])), vertical
-
-
-def _exclude(solver: _Rows, rows: NDArray[np.int64], found: list[Solution]) -> tuple[NDArray[np.int64], list[Solution]]:
-    """Leave out rows one by one while the χ² test fails and doing so mends most of it; one row stays to check by."""
-    while True:
-        best = found[0]
-        dof = solver.count(rows) - best.jacobian.shape[1]
-        if dof <= 0 or best.chi2 <= _chi2_limit(dof) or len(rows) <= solver.needed + 1:
-            return rows, found
-        trials: list[tuple[float, NDArray[np.int64]]] = []
-        for i in range(len(rows)):
-            fewer = np.delete(rows, i)
-            try:
-                again = solve(solver.problem(fewer), best.pose, best.clock_m)
-            except np.linalg.LinAlgError:
-                continue
-            trials.append((again.chi2 / max(1, solver.count(fewer) - best.jacobian.shape[1]), fewer))
-        if not trials:
-            return rows, found
-        mended, fewer = min(trials, key=lambda trial: trial[0])
-        again = solver.candidates(fewer)
-        if mended > 0.5 * best.chi2 / dof or not again:
-            return rows, found
-        rows, found = fewer, again
-
-
-def _tell_apart(best: Solution, rivals: list[Solution], site: Site) -> tuple[Solution, Solution | None, bool]:
-    """Choose among solutions that fit alike by the room's bounds; say so where that does not decide."""
+    Two that lie so close above each other that a range hardly tells them from their middle need no decision.
+    """
     if not rivals:
         return best, None, False
     if site.bounds_m is None:
-        return best, rivals[0], True
+        apart = best.pose[:3] - rivals[0].pose[:3]
+        close = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * abs(range_m)) < FLAT_M
+        return best, rivals[0], len(rivals) > 1 or not close
     low, high = np.array(site.bounds_m)
     inside = [s for s in [best, *rivals] if np.all(s.pose[:3] >= low - 0.1) and np.all(s.pose[:3] <= high + 0.1)]
     if len(inside) != 1:
@@ -239,7 +131,26 @@ def _tell_apart(best: Solution, rivals: list[Solution], site: Site) -> tuple[Sol
     return inside[0], others[0], False
 
 
-def _shift_to_origin(best: Solution, covariance: Floats, solver: _Rows) -> tuple[Floats, Floats]:
+def _between(best: Solution, mirror: Solution, covariance: Floats, solver: Rows) -> tuple[Solution, Floats]:
+    """Return the middle of two solutions just above each other; half their distance is the height's deviation."""
+    half_m = (best.pose[2] - mirror.pose[2]) / 2
+    pose = best.pose.copy()
+    pose[2] -= half_m
+    height = int(np.sum(solver.free[:2]))
+    wider = covariance.copy()
+    wider[height, :] = wider[:, height] = 0.0
+    wider[height, height] = half_m**2 + covariance[height, height]
+    return replace(best, pose=pose), wider
+
+
+def _too_weak(best: Solution, covariance: Floats, solver: Rows, rows: NDArray[np.int64]) -> bool:
+    """Whether the deviation is so large against the ranges that it means nothing."""
+    nearest = float(np.min(np.abs(solver.problem(rows).range_m - best.clock_m)))
+    places = int(np.sum(solver.free[:3]))
+    return float(np.max(np.diag(covariance)[:places])) > (0.5 * max(nearest, 0.2)) ** 2
+
+
+def _shift_to_origin(best: Solution, covariance: Floats, solver: Rows) -> tuple[Floats, Floats]:
     """Position of the vehicle's origin where a lone lever arm leaves the heading open.
 
     The arm becomes uncertainty, unless the vehicle drives, when it is taken to look where it goes.
@@ -261,23 +172,6 @@ def _shift_to_origin(best: Solution, covariance: Floats, solver: _Rows) -> tuple
 def _ranges(problem: Problem, solution: Solution) -> Floats:
     once = solve(problem, solution.pose, solution.clock_m, iterations=0)
     return problem.range_m - once.residual_m
-
-
-def _invert(jacobian: Floats) -> Floats | None:
-    """Covariance of a whitened Jacobian, None where it leaves a direction open."""
-    size = np.sqrt(np.sum(jacobian**2, axis=0)) + 1e-300
-    q, r = np.linalg.qr(jacobian / size)
-    del q
-    if len(r) < jacobian.shape[1] or np.min(np.abs(np.diag(r))) < 1e-6:
-        return None
-    half = np.linalg.solve(r, np.eye(len(r)))
-    return half @ half.T / np.outer(size, size)
-
-
-def _chi2_limit(dof: int) -> float:
-    from scipy.special import chdtri
-
-    return float(chdtri(dof, FALSE_ALARM))
 
 
 def _failed(epoch: RangeEpoch, vehicle: str, time_s: float, status: FixStatus, remedy: str) -> Fix:

@@ -12,12 +12,17 @@ MANOEUVRE_MPS2 = 1.0
 """Acceleration (one sigma) within an epoch: rows heard some milliseconds apart see another velocity."""
 
 
-def row_noise(epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats) -> tuple[Floats, Floats | None]:
+def row_noise(
+    epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats, speed_sd_mps: float = 0.0
+) -> tuple[Floats, Floats | None]:
     """Covariance of ranges (n, n) in m² and variances of range rates (n,) in m²/s², where there are any.
 
-    ``dt`` (n,) is when each row was heard from the instant the motion state belongs to.
+    ``dt`` (n,) is when each row was heard from the instant the motion state belongs to; ``speed_sd_mps`` the deviation
+    of a velocity that is taken as 0.
     """
-    covariance = epoch.covariance_m2[np.ix_(rows, rows)] + np.diag((MANOEUVRE_MPS2 * dt**2 / 2) ** 2)
+    covariance = epoch.covariance_m2[np.ix_(rows, rows)] + np.diag(
+        (MANOEUVRE_MPS2 * dt**2 / 2) ** 2 + (speed_sd_mps * dt) ** 2
+    )
     emitters = np.array([epoch.emitter[i] for i in rows])
     # a beacon's misplacement is the same for all who hear it
     covariance += np.where(emitters[:, None] == emitters, links.emitter_sd_m[rows] ** 2, 0.0)

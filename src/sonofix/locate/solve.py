@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,8 @@ def solve(problem: Problem, pose: Floats, clock_m: float, iterations: int = 50) 
         if new_chi2 > chi2 * (1 + 1e-9) + 1e-12:
             damping = 10 * max(damping, 1e-4)
             if damping > 1e8:
+                # no way down is left: a minimum, if a sharp one (beside a beacon the range has a kink)
+                converged = True
                 break
             continue
         small = float(np.max(np.abs(step) * size)) < 1e-4
@@ -92,3 +94,22 @@ def solve(problem: Problem, pose: Floats, clock_m: float, iterations: int = 50) 
             converged = True
             break
     return Solution(pose, clock_m, chi2, jacobian, residual, converged)
+
+
+def chi2(problem: Problem, pose: Floats, clock_m: float) -> float:
+    """Whitened misfit of ranges alone at a pose."""
+    n = len(problem.range_m)
+    plain = replace(problem, rate_mps=None, whiten=problem.whiten[:n, :n])
+    miss = _misfit(plain, pose, clock_m)[0]
+    return float(miss @ miss)
+
+
+def invert(jacobian: Floats) -> Floats | None:
+    """Covariance of a whitened Jacobian, None where it leaves a direction open."""
+    size = np.sqrt(np.sum(jacobian**2, axis=0)) + 1e-300
+    q, r = np.linalg.qr(jacobian / size)
+    del q
+    if len(r) < jacobian.shape[1] or np.min(np.abs(np.diag(r))) < 1e-5:
+        return None
+    half = np.linalg.solve(r, np.eye(len(r)))
+    return half @ half.T / np.outer(size, size)

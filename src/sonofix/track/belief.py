@@ -18,10 +18,12 @@ SIZE = len(POSE)
 class Motion:
     """How freely vehicles move: constant velocity, disturbed by white acceleration.
 
-    ``acceleration_psd`` in m²/s³ per axis, ``turn_psd`` in rad²/s³; ``clock_psd`` in m²/s³ of the clock's drift.
+    ``acceleration_psd`` in m²/s³ per horizontal axis, ``climb_psd`` upwards (vehicles keep to floors), ``turn_psd`` in
+    rad²/s³, ``clock_psd`` in m²/s³ of the clock's drift.
     """
 
     acceleration_psd: float = 0.5
+    climb_psd: float = 0.01
     turn_psd: float = 0.3
     clock_psd: float = 1e-6
 
@@ -77,7 +79,7 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
         for place, speed, psd in (
             (at, at + 4, motion.acceleration_psd),
             (at + 1, at + 5, motion.acceleration_psd),
-            (at + 2, at + 6, motion.acceleration_psd),
+            (at + 2, at + 6, motion.climb_psd),
             (at + 3, at + 7, motion.turn_psd),
         ):
             _integrate(transition, noise, place, speed, psd, dt, age, belief.free)
