@@ -269,10 +269,11 @@ class Receiver:
                 if self.site.beacon(emitter).vehicle is None or self.site.beacon(emitter).vehicle != microphone.vehicle
             }
             expected = {} if window.seeking else self._expect(window, microphone.id, list(windows))
-            found = acquire(self._plan, channel, first, microphone.id, windows, expected)
+            found, notes = acquire(self._plan, channel, first, microphone.id, windows, expected)
             if expected and len(found) < 0.7 * self._heard_last / len(self._microphones):
-                found = acquire(self._plan, channel, first, microphone.id, windows)
+                found, notes = acquire(self._plan, channel, first, microphone.id, windows)
             heard += found
+            flags += [f"microphone {microphone.id}: {text}" for text in notes]
         self._heard_last = len(heard)
         return tuple(heard), tuple(flags)
 

@@ -17,6 +17,7 @@ from sonofix.acquire.bank import Bank, make_bank
 from sonofix.acquire.baseband import Band, band_limited, design_band, downconvert
 from sonofix.acquire.refine import Burst, refine
 from sonofix.acquire.search import Peak, search
+from sonofix.acquire.tones import MARGIN_S, Tone, find_tones, level_db, refit
 from sonofix.records import Detection, Floats, Path, Prediction, Waveform
 
 NEAR_STRONGEST = 10 ** (-6 / 10)
@@ -60,8 +61,8 @@ class Plan:
 
     @property
     def margin_s(self) -> float:
-        """Samples wanted before the first arrival searched, for the filters to settle."""
-        return max(len(band.taps) / band.sample_rate_hz for band, _ in self.bands)
+        """Samples wanted before the first arrival searched and after the last burst: filters settle, tones show."""
+        return MARGIN_S + max(len(band.taps) / band.sample_rate_hz for band, _ in self.bands)
 
     @property
     def burst_s(self) -> float:
@@ -115,7 +116,7 @@ def acquire(
     receiver: str,
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction] | None = None,
-) -> tuple[Detection, ...]:
+) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
     """All bursts that one microphone heard in one epoch.
 
     Parameters
@@ -131,16 +132,24 @@ def acquire(
 
     Returns
     -------
-    tuple of Detection, strongest first
+    detections : tuple of Detection, strongest first
+    notes : tuple of str
+        What was done to the samples before.
     """
+    notes: list[str] = []
     found: list[tuple[Burst, Detection]] = []
     for band, banks in plan.bands:
         baseband, start_s = downconvert(samples, first_sample, band)
         if len(baseband):
             listening = [b for b in banks if b.emitter in windows]
-            found += _take_apart(plan, band, listening, baseband, start_s, receiver, windows, predictions or {})
+            tones = find_tones(baseband, band.rate_hz)
+            left = baseband - sum(tone.course for tone in tones)
+            for tone in tones:
+                text = f"a tone at {(band.carrier_hz + tone.offset_hz) / 1e3:.3f} kHz"
+                notes.append(f"{text}, {level_db(tone, left):.0f} dB over all else in the band, was taken out")
+            found += _take_apart(plan, band, listening, baseband, tones, start_s, receiver, windows, predictions or {})
     found.sort(key=lambda pair: -abs(pair[0].gain))
-    return tuple(detection for _, detection in found)
+    return tuple(detection for _, detection in found), tuple(notes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,6 +177,7 @@ def _take_apart(
     band: Band,
     banks: list[Bank],
     baseband: NDArray[np.complex128],
+    tones: list[Tone],
     start_s: float,
     receiver: str,
     windows: Mapping[str, tuple[float, float]],
@@ -178,7 +188,7 @@ def _take_apart(
     heard: list[_Heard] = []
     covariances: list[Floats] = []
     noise = np.zeros(0)
-    residual = baseband
+    residual = baseband - sum(tone.course for tone in tones)
 
     def accept(found: list[tuple[Bank, Peak]]) -> None:
         nonlocal bursts, covariances, residual, noise
@@ -190,13 +200,14 @@ def _take_apart(
 
     def settle(iterations: int) -> None:
         """Refine all paths together on the stretch of samples in which any of them sounds."""
-        nonlocal bursts, covariances, residual, noise
+        nonlocal bursts, covariances, residual, noise, tones
         begin = min(b.arrival_s - b.waveform.duration_s / 2 - 2e-3 for b in bursts)
         end = max(b.arrival_s - b.waveform.duration_s / 2 + h.sounds_s for b, h in zip(bursts, heard, strict=True))
         first = max(0, int((begin - start_s) * band.rate_hz))
         last = int((end - start_s) * band.rate_hz) + 1
+        clean = baseband - sum(tone.course for tone in tones)
         bursts, covariances, left, noise = refine(
-            baseband[first:last],
+            clean[first:last],
             start_s + first / band.rate_hz,
             band.rate_hz,
             bursts,
@@ -204,8 +215,12 @@ def _take_apart(
             band.whiteness,
             iterations,
         )
-        residual = baseband.copy()
+        residual = clean
         residual[first:last] = left
+        if tones:
+            heard_s = residual + sum(tone.course for tone in tones)
+            tones = refit(tones, heard_s, band.rate_hz)
+            residual = heard_s - sum(tone.course for tone in tones)
 
     for _ in range(MOST_ROUNDS):
         peaks: list[tuple[Bank, Peak]] = []
