@@ -96,8 +96,7 @@ def _follow(heard: Complexes, rate_hz: float, offset_hz: float, rounds: int = 6)
         step = np.linalg.lstsq(normal, np.einsum("in,n->i", np.conj(columns), miss).real, rcond=None)[0]
         phase = phase + np.clip(step[:4], -1.0, 1.0)
         level = level + step[4:]
-    course: Complexes = (level @ powers[:2]) * np.exp(1j * (phase @ powers)) * mixer
-    return course
+    return np.asarray((level @ powers[:2]) * np.exp(1j * (phase @ powers)) * mixer, np.complex128)
 
 
 def _alike(heard: Complexes, course: Complexes) -> bool:

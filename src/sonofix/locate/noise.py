@@ -11,6 +11,9 @@ from sonofix.records import Floats, RangeEpoch
 MANOEUVRE_MPS2 = 1.0
 """Acceleration (one sigma) within an epoch: rows heard some milliseconds apart see another velocity."""
 
+TYPICAL_SPEED_MPS = 1.5
+"""What a misplaced beacon's direction is taken to matter at."""
+
 
 def row_noise(
     epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats, speed_sd_mps: float = 0.0
@@ -28,4 +31,6 @@ def row_noise(
     covariance += np.where(emitters[:, None] == emitters, links.emitter_sd_m[rows] ** 2, 0.0)
     if epoch.range_rate_sd_mps is None:
         return covariance, None
-    return covariance, epoch.range_rate_sd_mps[rows] ** 2 + (MANOEUVRE_MPS2 * dt) ** 2
+    # a misplaced beacon is seen in another direction, so that its range rate is another part of the velocity
+    turned = TYPICAL_SPEED_MPS * links.emitter_sd_m[rows] / np.maximum(np.abs(epoch.range_m[rows]), 1.0)
+    return covariance, epoch.range_rate_sd_mps[rows] ** 2 + (MANOEUVRE_MPS2 * dt) ** 2 + turned**2

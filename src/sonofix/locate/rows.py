@@ -105,7 +105,8 @@ class Rows:
         anchors = fixed_ends - arms * np.array([0.0, 0.0, 1.0])
         problem = self.problem(rows)
         found: list[Solution] = []
-        for begin in starts(anchors, problem.range_m, self.level_m, self.clock):
+
+        def descend(begin: Floats) -> None:
             for yaw in self._yaws(problem, begin):
                 pose = np.zeros(8)
                 pose[:3], pose[3] = begin[:3], yaw
@@ -115,6 +116,13 @@ class Rows:
                     continue
                 if solution.converged:
                     found.append(solution)
+
+        for begin in starts(anchors, problem.range_m, self.level_m, self.clock):
+            descend(begin)
+        # anchors nearly in one plane have nearly a mirror solution, which the linear start may have missed, or hit
+        if found and self.free[3]:
+            best = min(found, key=lambda s: s.chi2)
+            descend(np.append(_mirrored(best.pose[:3], anchors, self.level_m is None), best.clock_m))
         out: list[Solution] = []
         for solution in sorted(found, key=lambda s: s.chi2):
             if not any(_alike(solution.pose, other.pose) for other in out):
@@ -145,6 +153,16 @@ class Rows:
             return None, None
         vertical = float(np.sqrt(covariance[2, 2])) if free[2] else None
         return float(np.sqrt(covariance[0, 0] + covariance[1, 1])), vertical
+
+
+def _mirrored(position: Floats, anchors: Floats, in_space: bool) -> Floats:
+    """Mirror image of a place in the plane (on a level: the line) that anchors are nearest to."""
+    dims = 3 if in_space else 2
+    centre = anchors[:, :dims].mean(axis=0)
+    _, _, axes = np.linalg.svd(anchors[:, :dims] - centre)
+    image = position.copy()
+    image[:dims] -= 2 * ((position[:dims] - centre) @ axes[-1]) * axes[-1]
+    return image
 
 
 def _alike(a: Floats, b: Floats) -> bool:
