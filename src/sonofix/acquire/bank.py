@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.acquire.baseband import Band
 from sonofix.records import Floats, Waveform
-from sonofix.signals.interpolate import sample
+from sonofix.signals.interpolate import read
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,6 +71,39 @@ def velocity_step_mps(waveform: Waveform, sound_speed_mps: float) -> float:
     return float(0.95 * 2.0 * allowed * sound_speed_mps / (frequency_hz * waveform.duration_s))
 
 
+@numba.njit(cache=True)
+def stretched(
+    table: NDArray[np.complex128],
+    table_rate_hz: float,
+    table_start_s: float,
+    half_s: float,
+    carrier_hz: float,
+    betas: Floats,
+    rate_hz: float,
+    lead_s: float,
+    count: int,
+) -> NDArray[np.complex64]:
+    """Unit-energy replicas (m, count) at range rates ``betas`` (m,) over c.
+
+    Stretched about the burst's middle, so that a delay means the same moment at every rate.
+    """
+    out = np.zeros((betas.shape[0], count), np.complex64)
+    for row in range(betas.shape[0]):
+        energy = 0.0
+        for n in range(count):
+            u = n / rate_hz - lead_s - half_s
+            position = (half_s + (1.0 - betas[row]) * u - table_start_s) * table_rate_hz
+            if position < 1.0 or position > table.shape[0] - 3.0:
+                continue
+            phase = -2.0 * np.pi * carrier_hz * betas[row] * u
+            value = read(table, position) * complex(np.cos(phase), np.sin(phase))
+            out[row, n] = value
+            energy += value.real**2 + value.imag**2
+        for n in range(count):
+            out[row, n] /= np.sqrt(energy)
+    return out
+
+
 def make_bank(emitter: str, waveform: Waveform, band: Band, max_rate_mps: float, sound_speed_mps: float) -> Bank:
     """Plan the replicas of one emitter for range rates within ±``max_rate_mps``.
 
@@ -82,15 +116,16 @@ def make_bank(emitter: str, waveform: Waveform, band: Band, max_rate_mps: float,
     slowest = 1.0 - max(0.0, float(rates[-1])) / sound_speed_mps
     end_s = waveform.start_s + len(waveform.signature) / waveform.rate_hz
     count = int(np.ceil((end_s / slowest + lead_s / slowest) * band.rate_hz)) + 1
-    replicas = np.empty((len(rates), count), np.complex64)
-    heard_s = np.arange(count) / band.rate_hz - lead_s
-    for row, rate in enumerate(rates):
-        beta = rate / sound_speed_mps
-        # about the burst's middle, so that a delay means the same moment at every rate
-        u = heard_s - waveform.duration_s / 2
-        tau = waveform.duration_s / 2 + (1.0 - beta) * u
-        values = sample(waveform.signature, waveform.rate_hz, waveform.start_s, tau)
-        values *= np.exp(-2j * np.pi * waveform.carrier_hz * beta * u)
-        replicas[row] = values / np.linalg.norm(values)
+    replicas = stretched(
+        waveform.signature,
+        waveform.rate_hz,
+        waveform.start_s,
+        waveform.duration_s / 2,
+        waveform.carrier_hz,
+        rates / sound_speed_mps,
+        band.rate_hz,
+        lead_s,
+        count,
+    )
     energy = float(np.sum(np.abs(waveform.signature) ** 2)) * band.rate_hz / waveform.rate_hz
     return Bank(emitter, waveform, rates, replicas, lead_s, energy)

@@ -54,7 +54,7 @@ class Band:
         gain = np.zeros(np.shape(offset_hz))
         # a cosine sum, on a grid fine enough for linear interpolation: the taps are few hundred, the offsets many
         top = min(self.sample_rate_hz / 2, float(np.max(np.abs(offset_hz), initial=0.0)))
-        grid = np.linspace(0.0, top, 4096)
+        grid = np.linspace(0.0, top, 2048)
         value = np.cos(2 * np.pi / self.sample_rate_hz * grid[:, None] * n[None, :]) @ (self.taps / np.sum(self.taps))
         inside = np.abs(offset_hz) <= top
         gain[inside] = np.interp(np.abs(offset_hz[inside]), grid, value)
@@ -154,12 +154,16 @@ def downconvert(samples: NDArray[np.float32], first_sample: int, band: Band) -> 
 
 def band_limited(waveform: Waveform, band: Band) -> Waveform:
     """Return the burst as it stands in the base band: its tables passed through the same filter."""
+    import scipy.fft
+
     pad = int(np.ceil(len(band.taps) / band.sample_rate_hz * waveform.rate_hz / 2)) + 4
-    offset_hz = np.fft.fftfreq(len(waveform.envelope) + 2 * pad, 1.0 / waveform.rate_hz)
-    gain = band.response(offset_hz)
+    length = int(scipy.fft.next_fast_len(len(waveform.envelope) + 2 * pad) or 0)
+    gain = band.response(np.fft.fftfreq(length, 1.0 / waveform.rate_hz))
 
     def filtered(table: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        return np.fft.ifft(np.fft.fft(np.pad(table, pad)) * gain)
+        padded = np.zeros(length, complex)
+        padded[pad : pad + len(table)] = table
+        return np.asarray(scipy.fft.ifft(np.asarray(scipy.fft.fft(padded)) * gain))
 
     envelope = filtered(waveform.envelope)
     signature = envelope if waveform.signature is waveform.envelope else filtered(waveform.signature)
