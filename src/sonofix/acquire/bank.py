@@ -6,8 +6,7 @@ A receding source stretches the burst: heard at range rate v its time runs at th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
@@ -17,11 +16,11 @@ from sonofix.acquire.baseband import Band
 from sonofix.records import Floats, Waveform
 from sonofix.signals.interpolate import read
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
 LOSS_DB = 1.0
 """Of correlation power at the edge of a velocity cell, at worst."""
+
+MOST_KEPT = 3
+"""Transform lengths whose spectra are kept: one for a cold search, one for a warm one, one to spare."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +39,8 @@ class Bank:
     lead_s : float
     energy : float
         Of the signature at unit gain, in base-band samples.
+    kept : dict
+        Spectra by transform length, filled by `spectra`.
     """
 
     emitter: str
@@ -48,12 +49,20 @@ class Bank:
     replicas: NDArray[np.complex64]
     lead_s: float
     energy: float
+    kept: dict[int, NDArray[np.complex64]] = field(default_factory=dict, repr=False)
 
-    def spectra(self, length: int, rows: Sequence[int] | slice = slice(None)) -> NDArray[np.complex64]:
-        """Conjugate spectra (m, length) of the replicas, ready to multiply with a spectrum of samples."""
+    def spectra(self, length: int, rows: slice = slice(None)) -> NDArray[np.complex64]:
+        """Conjugate spectra (m, length) of the replicas, ready to multiply with a spectrum of samples.
+
+        Kept once computed: a plan searches a few lengths, over and over.
+        """
         import scipy.fft
 
-        return np.conj(np.asarray(scipy.fft.fft(self.replicas[rows], length, axis=-1))).astype(np.complex64)
+        if length not in self.kept:
+            if len(self.kept) >= MOST_KEPT:
+                self.kept.clear()
+            self.kept[length] = np.conj(np.asarray(scipy.fft.fft(self.replicas, length, axis=-1)))
+        return self.kept[length][rows]
 
 
 def velocity_step_mps(waveform: Waveform, sound_speed_mps: float) -> float:

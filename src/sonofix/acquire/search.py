@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from sonofix.acquire.bank import Bank
 from sonofix.acquire.baseband import Band
 
+SHORT_SEARCH = 256
+"""Delays that a warm search spans at most, mostly."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peak:
@@ -74,7 +77,8 @@ def search(
         rows = slice(low, max(high, low + 1))
     count = last - first + 1
     stretch = baseband[first : last + bank.replicas.shape[1]].astype(np.complex64)
-    length = int(scipy.fft.next_fast_len(len(stretch) + 1) or 0)
+    # short searches share one length, so that their spectra are computed once
+    length = int(scipy.fft.next_fast_len(bank.replicas.shape[1] + max(count, SHORT_SEARCH)) or 0)
     spectrum = np.asarray(scipy.fft.fft(stretch, length))
     surface: NDArray[np.complex64] = np.asarray(
         scipy.fft.ifft(spectrum * bank.spectra(length, rows), axis=-1, overwrite_x=True)
