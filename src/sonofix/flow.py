@@ -245,14 +245,18 @@ class Receiver:
                 self._schedule.found(starts_s)
                 if not heard:
                     yield self._step(window, heard, flags)
-                continue
-            yield self._step(window, heard, flags)
-            self._schedule.done(starts_s)
-            following = self._schedule.window()
-            if following is not None:
-                drop = round((following.opens_s - self._plan.margin_s) * rate) - self._first
-                drop = min(max(drop, 0), len(self._samples) - 1)
-                self._samples, self._first = self._samples[drop:], self._first + drop
+            else:
+                yield self._step(window, heard, flags)
+                self._schedule.done(starts_s)
+            self._forget()
+
+    def _forget(self) -> None:
+        """Let go of samples that no later epoch needs."""
+        following = self._schedule.window()
+        if following is not None:
+            drop = round((following.opens_s - self._plan.margin_s) * self._plan.sample_rate_hz) - self._first
+            drop = min(max(drop, 0), len(self._samples) - 1)
+            self._samples, self._first = self._samples[drop:], self._first + drop
 
     def _hear(
         self, window: Window, samples: NDArray[np.float32], first: int

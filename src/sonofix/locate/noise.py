@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import Links
 from sonofix.records import Floats, RangeEpoch
 
-MANOEUVRE_MPS2 = 1.0
+MANOEUVRE_MPS2 = 2.0
 """Acceleration (one sigma) within an epoch: rows heard some milliseconds apart see another velocity."""
 
 TYPICAL_SPEED_MPS = 1.5
@@ -18,7 +18,7 @@ TYPICAL_SPEED_MPS = 1.5
 def row_noise(
     epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats, speed_sd_mps: float = 0.0
 ) -> tuple[Floats, Floats | None]:
-    """Covariance of ranges (n, n) in m² and variances of range rates (n,) in m²/s², where there are any.
+    """Covariances (n, n) of ranges in m² and of range rates in m²/s², where there are any.
 
     ``dt`` (n,) is when each row was heard from the instant the motion state belongs to; ``speed_sd_mps`` the deviation
     of a velocity that is taken as 0.
@@ -33,4 +33,4 @@ def row_noise(
         return covariance, None
     # a misplaced beacon is seen in another direction, so that its range rate is another part of the velocity
     turned = TYPICAL_SPEED_MPS * links.emitter_sd_m[rows] / np.maximum(np.abs(epoch.range_m[rows]), 1.0)
-    return covariance, epoch.range_rate_sd_mps[rows] ** 2 + (MANOEUVRE_MPS2 * dt) ** 2 + turned**2
+    return covariance, np.diag(epoch.range_rate_sd_mps[rows] ** 2 + (MANOEUVRE_MPS2 * dt) ** 2 + turned**2)

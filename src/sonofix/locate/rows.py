@@ -16,6 +16,9 @@ from sonofix.records import Floats, RangeEpoch
 UNKNOWN_SPEED_MPS = 1.0
 """Deviation of the velocity (from 0) where no range rates tell of it: a walk."""
 
+CLOCK_SPEED_SD = 1e-4
+"""Deviation of a free clock's speed from the recorder's: two cheap crystals."""
+
 YAW_STARTS = 12
 """Headings looked at from each starting place."""
 
@@ -76,15 +79,18 @@ class Rows:
     def problem(self, rows: NDArray[np.int64]) -> Problem:
         """Return what is to be solved for a selection of rows."""
         epoch, dt = self.epoch, self.dt[rows]
-        covariance, rate_variance = row_noise(epoch, self.links, rows, dt, 0.0 if self.rates else UNKNOWN_SPEED_MPS)
+        covariance, rates = row_noise(epoch, self.links, rows, dt, 0.0 if self.rates else UNKNOWN_SPEED_MPS)
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
         rate = None
-        if epoch.range_rate_mps is not None and rate_variance is not None:
+        if epoch.range_rate_mps is not None and rates is not None:
             rate = epoch.range_rate_mps[rows]
+            if self.clock:
+                # a clock of its own runs at its own speed, which all range rates share
+                rates = rates + (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
             n = len(rows)
             both = np.zeros((2 * n, 2 * n))
             both[:n, :n] = whiten
-            both[n:, n:] = np.diag(rate_variance**-0.5)
+            both[n:, n:] = np.linalg.inv(np.linalg.cholesky(rates))
             whiten = both
         return Problem(
             self.as_first.rows(rows),

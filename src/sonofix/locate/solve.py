@@ -67,7 +67,7 @@ def solve(problem: Problem, pose: Floats, clock_m: float, iterations: int = 50) 
     """Descend from a start until the step is far below the deviation of what is solved for."""
     miss, jacobian, residual = _misfit(problem, pose, clock_m)
     chi2 = float(miss @ miss)
-    damping, converged = 1e-6, False
+    damping, converged, gained = 1e-6, False, np.inf
     for _ in range(iterations):
         size = np.sqrt(np.sum(jacobian**2, axis=0)) + 1e-300
         scaled = jacobian / size
@@ -82,18 +82,18 @@ def solve(problem: Problem, pose: Floats, clock_m: float, iterations: int = 50) 
         if new_chi2 > chi2 * (1 + 1e-9) + 1e-12:
             damping = 10 * max(damping, 1e-4)
             if damping > 1e8:
-                # no way down is left: a minimum, if a sharp one (beside a beacon the range has a kink)
-                converged = True
                 break
             continue
         small = float(np.max(np.abs(step) * size)) < 1e-4
         pose, clock_m = tried, tried_clock
         miss, jacobian, residual = new_miss, new_jacobian, new_residual
+        gained = chi2 - new_chi2
         chi2, damping = new_chi2, damping / 10
         if small:
             converged = True
             break
-    return Solution(pose, clock_m, chi2, jacobian, residual, converged)
+    # beside a beacon the range has a kink: steps zigzag over it long after nothing is gained any more
+    return Solution(pose, clock_m, chi2, jacobian, residual, converged or gained < 1e-3)
 
 
 def chi2(problem: Problem, pose: Floats, clock_m: float) -> float:

@@ -8,10 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import POSE
+from sonofix.locate.rows import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
 
 SIZE = len(POSE)
+
+SOUND_SPEED_MPS = 343.0
+"""Near enough to turn a clock's speed into m/s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +140,7 @@ def place(belief: Belief, vehicle: int, fix: Fix) -> Belief:
         clock = [len(mean) - 2, len(mean) - 1]
         covariance[clock, :] = covariance[:, clock] = 0.0
         mean[clock] = [fix.clock_offset_m or 0.0, 0.0]
-        covariance[-1, -1] = 0.02**2  # 60 ppm of the sound speed
+        covariance[-1, -1] = (CLOCK_SPEED_SD * SOUND_SPEED_MPS) ** 2
         free[clock] = True
     index = [names[state] for state in fix.states]
     covariance[np.ix_(index, index)] = fix.covariance

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import Links, link, row_times
 from sonofix.locate.fix import fix
+from sonofix.locate.rows import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, start_at
@@ -111,7 +112,8 @@ class Follower:
         mean[-1] = 0.0
         covariance[-2:, :] = covariance[:, -2:] = 0.0
         covariance[-2, -2] = 100.0**2
-        free[-2:] = [True, False]
+        covariance[-1, -1] = (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
+        free[-2:] = True
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
 
     def _learn(self, surprise: Floats) -> None:
@@ -141,7 +143,7 @@ class Follower:
                 continue
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
             self.belief = predict(place(aged, who, start), self.belief.time_s, self.motion)
-            self._refused[who] = 0
+            self._refused[who], self._heard[who] = 0, True
             taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")

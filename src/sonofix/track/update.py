@@ -51,7 +51,10 @@ def update(
     surprise = miss[:n] ** 2 / (spread[:n] + np.diag(noise[0]))
     near = surprise <= GATE_SIGMA**2
     if noise[1] is not None:
-        near &= np.abs(miss[n:]) <= GATE_SIGMA * np.sqrt(spread[n:] + noise[1])
+        near &= np.abs(miss[n:]) <= GATE_SIGMA * np.sqrt(spread[n:] + np.diag(noise[1]))
+    if n > 2 and 2 * np.sum(near) < n:
+        # most disagree: those that do not may do so by chance, and would drag the track along
+        near[:] = False
     rows, dt = rows[near], dt[near]
     if not len(rows):
         return belief, used, surprise
@@ -62,7 +65,7 @@ def update(
     if rates is not None:
         noise_all = np.zeros((2 * n, 2 * n))
         noise_all[:n, :n] = covariance_r
-        noise_all[n:, n:] = np.diag(rates)
+        noise_all[n:, n:] = rates
     mean = belief.mean
     chosen = links.rows(rows)
     gain = derivative = np.zeros((0, 0))
@@ -95,8 +98,10 @@ def _misfit(
         # the clock's drift within an epoch is far below any range's deviation
         derivative[:, -2] = 1.0
         miss = miss - mean[-2]
+        rate = rate + mean[-1]
     if epoch.range_rate_mps is None:
         return miss, derivative
     rates = np.zeros((n, len(mean)))
     rates[:, :-2] = by_rate.reshape(n, -1)
+    rates[:, -1] = 1.0 if clock else 0.0
     return np.concatenate([miss, epoch.range_rate_mps[rows] - rate]), np.vstack([derivative, rates])
