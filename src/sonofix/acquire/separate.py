@@ -127,8 +127,14 @@ class Separation:
             if peaks:
                 strongest = max(peak.power for _, peak in peaks)
                 self._accept([(bank, peak) for bank, peak in peaks if peak.power >= NEAR_STRONGEST * strongest])
-            elif warm and disturbed:
+            elif warm and (disturbed or not self.sounds):
                 warm = {}
+            elif disturbed or not self.sounds:
+                # nothing stands out of the crowd, if there is one: begin with its loudest
+                crowd = [(bank, p) for bank in self.banks if (p := self._look(bank, warm, False, by_margins=True))]
+                if not crowd:
+                    break
+                self._accept([max(crowd, key=lambda found: found[1].power)])
             else:
                 break
         self._prune()
@@ -146,7 +152,9 @@ class Separation:
                 out.append(_detection(first, own, receiver, self.band))
         return out
 
-    def _look(self, bank: Bank, predictions: Mapping[str, Prediction], echoes: bool) -> Peak | None:
+    def _look(
+        self, bank: Bank, predictions: Mapping[str, Prediction], echoes: bool, by_margins: bool = False
+    ) -> Peak | None:
         """Search one emitter in what is left; None where nothing is worth trying."""
         own = [s for s in self.sounds if s.bank is bank]
         if own and (not echoes or len(own) >= MOST_PATHS):
@@ -164,7 +172,11 @@ class Separation:
         peak = search(
             self.residual, self.start_s, bank, self.band, opens_s, closes_s, rates, known_s, self.false_alarm_rate
         )
-        if peak is None or peak.power < (peak.threshold if own else peak.worth_trying) * peak.noise:
+        if peak is None:
+            return None
+        # many loud bursts at once raise the median that noise is judged by: the quiet margins know better
+        noise = min(peak.noise, self._floor * self.band.whiteness) if by_margins else peak.noise
+        if peak.power < (peak.threshold if own else peak.worth_trying) * noise:
             return None
         return peak if peak.power > PATH_POWER * max((s.power for s in own), default=0.0) else None
 
