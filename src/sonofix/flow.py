@@ -135,13 +135,16 @@ class Street:
     def _place(self, start: Table, time_s: float) -> None:
         """Put vehicles where start.csv says, once."""
         self._start = None
+        if not self.site.vehicles:
+            raise ValueError("start.csv places a vehicle, but the site has none: add a [[vehicle]]")
         vehicles = start.names.get("vehicle") or (self.site.vehicles[0].id,) * len(start.columns["x_m"])
         for i, vehicle in enumerate(vehicles):
             z = start.columns.get("z_m")
             level = self.site.vehicle(vehicle).z_m
             height = level if level is not None else (0.0 if z is None or np.isnan(z[i]) else float(z[i]))
             position = np.array([start.columns["x_m"][i], start.columns["y_m"][i], height])
-            self.follower.start(vehicle, time_s, position, float(start.columns["yaw_rad"][i]))
+            yaw = float(np.nan_to_num(start.columns["yaw_rad"][i])) if "yaw_rad" in start.columns else 0.0
+            self.follower.start(vehicle, time_s, position, yaw)
 
     def _between(self, before: Belief, latest: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         """Return estimates on the grid of the wished rate up to the latest instant, by what was known at each."""
@@ -207,6 +210,9 @@ class Receiver:
         self._schedule = Schedule(site.schedule.period_s, reach_s(site, self.sound_speed_mps), sync_s, known, regular)
         self._street = Street(site, start, rate_hz)
         self._offsets_s = {b.id: b.offset_s + b.delay_s for b in site.coded_beacons}
+        lags = [m.delay_s for m in self._microphones]
+        self._earliest_s = min(self._offsets_s.values()) + min(lags)
+        self._latest_s = max(self._offsets_s.values()) + max(lags)
         self._samples = np.zeros((0, 0), np.float32)
         self._first = 0  # index of _samples[0] in the stream; below 0 for the silence before it
         self._heard_last = 0
@@ -215,9 +221,10 @@ class Receiver:
     def feed(self, block: NDArray[np.float32]) -> Iterator[Step]:
         """Take in samples (n, channels), full scale ±1, and yield what they complete."""
         if not self._samples.size:
-            lead = int(np.ceil(self._plan.margin_s * self._plan.sample_rate_hz))
+            lead = int(np.ceil((self._plan.margin_s - min(0.0, self._earliest_s)) * self._plan.sample_rate_hz))
             self._samples, self._first = np.zeros((lead, block.shape[1]), np.float32), -lead
         self._samples = np.concatenate([self._samples, block])
+        self._forget()
         yield from self._listen(complete=True)
 
     def finish(self) -> Iterator[Step]:
@@ -226,20 +233,26 @@ class Receiver:
 
     def _listen(self, complete: bool) -> Iterator[Step]:
         rate = self._plan.sample_rate_hz
-        latest_s = max(self._offsets_s.values())
         while (window := self._schedule.window()) is not None:
             end_s = (self._first + len(self._samples)) / rate
-            wanted_s = window.closes_s + latest_s + self._plan.burst_s + self._plan.margin_s
+            wanted_s = window.closes_s + self._latest_s + self._plan.burst_s + self._plan.margin_s
             if complete and wanted_s > end_s:
                 break
-            if not complete and window.opens_s + min(w.duration_s for w in self.waveforms.values()) > end_s:
+            shortest_s = min(w.duration_s for w in self.waveforms.values())
+            if not complete and window.opens_s + self._earliest_s + shortest_s > end_s:
                 break
-            begin = max(0, round((window.opens_s - self._plan.margin_s) * rate) - self._first)
+            begin = max(0, round((window.opens_s + self._earliest_s - self._plan.margin_s) * rate) - self._first)
             end = round(wanted_s * rate) - self._first
             first = self._first + begin
             heard, flags = self._hear(window, self._samples[begin:end], first)
             starts_s = np.array(
-                [d.arrival_s - self.waveforms[d.emitter].duration_s / 2 - self._offsets_s[d.emitter] for d in heard]
+                [
+                    d.arrival_s
+                    - self.waveforms[d.emitter].duration_s / 2
+                    - self._offsets_s[d.emitter]
+                    - self.site.microphone(d.receiver).delay_s
+                    for d in heard
+                ]
             )
             if window.seeking:
                 self._schedule.found(starts_s)
@@ -253,9 +266,11 @@ class Receiver:
     def _forget(self) -> None:
         """Let go of samples that no later epoch needs."""
         following = self._schedule.window()
+        drop = len(self._samples) - 1
         if following is not None:
-            drop = round((following.opens_s - self._plan.margin_s) * self._plan.sample_rate_hz) - self._first
-            drop = min(max(drop, 0), len(self._samples) - 1)
+            needed_s = following.opens_s + self._earliest_s - self._plan.margin_s
+            drop = min(drop, round(needed_s * self._plan.sample_rate_hz) - self._first)
+        if drop > 0:
             self._samples, self._first = self._samples[drop:], self._first + drop
 
     def _hear(

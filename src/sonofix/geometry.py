@@ -18,6 +18,12 @@ from sonofix.site import Beacon, Microphone, Site
 POSE = ("x", "y", "z", "yaw", "vx", "vy", "vz", "yaw_rate")
 """Components of one vehicle's motion state, in m, rad, m/s and rad/s."""
 
+SAME_ARM_M = 1e-3
+"""Lever arms that differ by less, seen from above, are one."""
+
+DRIVING_MPS = 0.1
+"""Above this speed a vehicle is taken to look where it goes."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Links:
@@ -54,8 +60,35 @@ class Links:
         )
 
 
+def open_arms(site: Site) -> Floats:
+    """Horizontal lever arms (V, 2) that no heading places: of vehicles whose ends all sit on one vertical line.
+
+    Nothing tells such a vehicle's heading, so its motion is followed at that line (`link` gives its ends so), and
+    `from_arm` goes back to its origin.
+    """
+    arms = np.zeros((len(site.vehicles), 2))
+    for i, vehicle in enumerate(site.vehicles):
+        ends = [n.lever_arm_m[:2] for n in (*site.beacons, *site.microphones) if n.vehicle == vehicle.id]
+        if ends and all(np.hypot(e[0] - ends[0][0], e[1] - ends[0][1]) < SAME_ARM_M for e in ends):
+            arms[i] = ends[0]
+    return arms
+
+
+def from_arm(arm: Floats, velocity: Floats) -> tuple[Floats, float]:
+    """Where the origin is from a point on a horizontal arm of open heading, and with what deviation per axis.
+
+    A vehicle that drives is taken to look where it goes, within 0.1 rad; one that stands may look anywhere.
+    """
+    length = float(np.hypot(arm[0], arm[1]))
+    speed = float(np.hypot(velocity[0], velocity[1]))
+    if speed < DRIVING_MPS or not length:
+        return np.zeros(2), length
+    along = velocity[:2] / speed
+    return -(arm[0] * along + arm[1] * np.array([-along[1], along[0]])), 0.1 * length
+
+
 def link(site: Site, emitters: tuple[str, ...], receivers: tuple[str, ...]) -> Links:
-    """Look up the ends of rows in a site.
+    """Look up the ends of rows in a site; lever arms are from where a vehicle's motion is followed (`open_arms`).
 
     Raises
     ------
@@ -63,11 +96,12 @@ def link(site: Site, emitters: tuple[str, ...], receivers: tuple[str, ...]) -> L
         If an id is not in the site.
     """
     vehicles = {v.id: i for i, v in enumerate(site.vehicles)}
+    arms = np.vstack([np.column_stack([open_arms(site), np.zeros(len(vehicles))]), np.zeros((1, 3))])
 
     def ends(nodes: list[Beacon] | list[Microphone]) -> tuple[NDArray[np.int64], Floats]:
         carrier = np.array([-1 if n.vehicle is None else vehicles[n.vehicle] for n in nodes], np.int64)
         point = np.array([n.position_m or n.lever_arm_m for n in nodes], float).reshape(-1, 3)
-        return carrier, point
+        return carrier, point - arms[carrier]
 
     beacons = [site.beacon(e) for e in emitters]
     emitter_vehicle, emitter_point = ends(beacons)

@@ -55,7 +55,7 @@ def make_plan(
     sample_rate_hz: float,
     sound_speed_mps: float,
     max_rate_mps: float = 3.0,
-    max_acceleration_mps2: float = 2.0,
+    max_acceleration_mps2: float = 4.0,
     false_alarm_rate: float = 1e-4,
 ) -> Plan:
     """Plan the acquisition of a set of beacons.
@@ -66,7 +66,7 @@ def make_plan(
     max_rate_mps : float
         Range rates searched: ±.
     max_acceleration_mps2 : float
-        One-sigma range acceleration within a burst (a pass at 2 m/s and 2 m gives 2 m/s²).
+        One-sigma range acceleration within a burst (a pass at 3 m/s and 2 m gives 4.5 m/s²).
 
     Raises
     ------

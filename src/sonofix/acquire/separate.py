@@ -30,6 +30,9 @@ PATH_POWER = 10 ** (-12 / 10)
 UNEXPLAINED = 1.3
 """Power left while bursts sound, over that of their quiet margins, at which there must be more to find."""
 
+RESIDUE = 10 ** (-12 / 10)
+"""What a poorly matched burst leaves behind is weaker than this share of it."""
+
 MOST_PATHS = 8
 """Of one burst."""
 
@@ -216,7 +219,10 @@ class Separation:
         """Drop what was only tried and does not stand out even now that all else is gone."""
         while self.sounds:
             self._settle(FULL_ITERATIONS)
-            sure = [s for s in self.sounds if s.clear or s.energy > s.threshold * s.noise]
+            # beside what no burst explains, a weak peak may be part of it, however clear it looked
+            disturbed = self._power_left() > UNEXPLAINED * self._floor
+            weak = RESIDUE * max(s.energy for s in self.sounds) if disturbed else 0.0
+            sure = [s for s in self.sounds if (s.clear and s.energy >= weak) or s.energy > s.threshold * s.noise]
             if len(sure) == len(self.sounds):
                 break
             self.sounds = sure

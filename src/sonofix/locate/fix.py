@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE, link, row_times
+from sonofix.geometry import POSE, from_arm, link, open_arms, row_times
 from sonofix.locate.exclude import agrees, exclude
 from sonofix.locate.rows import Rows
-from sonofix.locate.solve import Problem, Solution, invert, solve
+from sonofix.locate.solve import Solution, invert, solve
 from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
@@ -57,6 +57,7 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
     found = solver.candidates(rows)
     if not found:
         return _failed(epoch, vehicle, time_s, "no-convergence", "no position fits; check beacon positions and units")
+    everything = found[0]
     kept, found, isolated = exclude(solver, rows, found)
     best = found[0]
     status: FixStatus = "ok"
@@ -66,12 +67,12 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         status, inflation = "inconsistent", best.chi2 / (solver.count(kept) - best.jacobian.shape[1])
         remedy = "ranges disagree and no single one explains it; check beacon positions, sound speed and echoes"
     elif not isolated:
-        status = "inconsistent"
+        status, inflation = "inconsistent", everything.chi2 / (solver.count(rows) - everything.jacobian.shape[1])
         remedy = "a range is wrong, but which cannot be told; bring more beacons in reach"
     rivals = [s for s in found[1:] if s.chi2 < best.chi2 + AMBIGUOUS_CHI2 * inflation]
     best, mirror, undecided = _tell_apart(best, rivals, site, float(np.median(epoch.range_m[kept])))
     if undecided:
-        text = "two mirror positions fit alike; state the room's bounds_m or the vehicle's z_m, or raise one beacon"
+        text = "two positions or headings fit alike; state the room's bounds_m or the vehicle's z_m, or move one beacon"
         return replace(
             _failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=None if mirror is None else mirror.pose[:3]
         )
@@ -86,9 +87,8 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
     used = np.zeros(len(epoch), bool)
     used[kept] = True
     residual = np.full(len(epoch), np.nan)
-    full = solver.problem(rows)
-    residual[rows] = full.range_m - _ranges(full, best)
-    position, covariance = _shift_to_origin(best, covariance * inflation, solver)
+    residual[rows] = solve(solver.problem(rows), best.pose, best.clock_m, iterations=0).residual_m
+    position, covariance = _shift_to_origin(best, covariance * inflation, solver.open_arm + open_arms(site)[who])
     return Fix(
         time_s=time_s,
         vehicle=vehicle,
@@ -150,28 +150,13 @@ def _too_weak(best: Solution, covariance: Floats, solver: Rows, rows: NDArray[np
     return float(np.max(np.diag(covariance)[:places])) > (0.5 * max(nearest, 0.2)) ** 2
 
 
-def _shift_to_origin(best: Solution, covariance: Floats, solver: Rows) -> tuple[Floats, Floats]:
-    """Position of the vehicle's origin where a lone lever arm leaves the heading open.
-
-    The arm becomes uncertainty, unless the vehicle drives, when it is taken to look where it goes.
-    """
-    position = best.pose[:3].copy()
-    if not solver.open_arm_m:
-        return position, covariance
-    speed = float(np.hypot(best.pose[4], best.pose[5]))
-    covariance = covariance.copy()
-    if speed > 0.1:
-        along = best.pose[4:6] / speed
-        position[:2] -= solver.arm[0] * along + solver.arm[1] * np.array([-along[1], along[0]])
-        covariance[:2, :2] += np.eye(2) * (0.1 * solver.open_arm_m) ** 2
-    else:
-        covariance[:2, :2] += np.eye(2) * solver.open_arm_m**2
+def _shift_to_origin(best: Solution, covariance: Floats, arm: Floats) -> tuple[Floats, Floats]:
+    """Position of the vehicle's origin where a lever arm leaves the heading open: the arm becomes uncertainty."""
+    position, covariance = best.pose[:3].copy(), covariance.copy()
+    shift, sd_m = from_arm(arm, best.pose[4:7])
+    position[:2] += shift
+    covariance[:2, :2] += np.eye(2) * sd_m**2
     return position, covariance
-
-
-def _ranges(problem: Problem, solution: Solution) -> Floats:
-    once = solve(problem, solution.pose, solution.clock_m, iterations=0)
-    return problem.range_m - once.residual_m
 
 
 def _failed(epoch: RangeEpoch, vehicle: str, time_s: float, status: FixStatus, remedy: str) -> Fix:

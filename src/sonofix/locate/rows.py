@@ -56,7 +56,7 @@ class Rows:
         if self.rates:
             self.free[4:] = [True, True, level_m is None, turns]
         # two ends on one body fix the heading; a lone one off the axis leaves its origin open by its arm
-        self.open_arm_m = 0.0 if turns else float(np.hypot(*self.arm[:2]))
+        self.open_arm = np.zeros(2) if turns else self.arm[:2]
         self.needed = int(self.free[:4].sum()) + self.clock
         here = links
         self.as_first = Links(
@@ -69,7 +69,7 @@ class Rows:
 
     def _unseen(self, vehicle: NDArray[np.int64]) -> Floats:
         """Part of mounted lever arms that no heading places: solved for at the arm's own point."""
-        arm = np.array([self.arm[0], self.arm[1], 0.0]) if self.open_arm_m else np.zeros(3)
+        arm = np.append(self.open_arm, 0.0)
         return np.where((vehicle >= 0)[:, None], arm, 0.0)
 
     def count(self, rows: NDArray[np.int64]) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE
+from sonofix.geometry import POSE, from_arm, open_arms
 from sonofix.locate.rows import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
@@ -117,21 +117,23 @@ def _integrate(
         noise[speed, place] += psd * dt * age / 2
 
 
-def place(belief: Belief, vehicle: int, fix: Fix) -> Belief:
+def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
     """Put a vehicle where a fix says, forgetting what was believed of it.
 
-    Velocities that the fix leaves open start at 0 ± 1 m/s.
+    ``arm`` (2,) is its `geometry.open_arms`: the motion is followed there. Velocities that the fix leaves open start
+    at 0 ± 1 m/s.
     """
     if fix.position_m is None or fix.covariance is None:
         raise ValueError(f"a fix of status {fix.status!r} has no position to place vehicle {fix.vehicle} at")
     at = SIZE * vehicle
     own = np.arange(at, at + SIZE)
     names = {name: at + i for i, name in enumerate(POSE)}
+    shift, _ = from_arm(arm, np.zeros(3) if fix.velocity_mps is None else fix.velocity_mps)
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
     covariance[own, :] = covariance[:, own] = 0.0
     free[own] = False
     mean[own] = 0.0
-    mean[at : at + 3] = fix.position_m
+    mean[at : at + 3] = fix.position_m - np.append(shift, 0.0)
     if fix.velocity_mps is not None:
         mean[at + 4 : at + 7] = fix.velocity_mps
     mean[at + 3] = fix.yaw_rad or 0.0
@@ -180,14 +182,17 @@ def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estima
         own.append(n - 2)
         names.append("clock")
     pose = belief.mean[at : at + SIZE]
+    covariance = belief.covariance[np.ix_(own, own)].copy()
+    shift, sd_m = from_arm(open_arms(site)[vehicle], pose[4:7])
+    covariance[:2, :2] += np.eye(2) * sd_m**2
     return Estimate(
         time_s=belief.time_s,
         vehicle=site.vehicles[vehicle].id,
         states=tuple(names),
-        position_m=pose[:3].copy(),
+        position_m=pose[:3] + np.append(shift, 0.0),
         velocity_mps=pose[4:7].copy(),
         yaw_rad=float(np.angle(np.exp(1j * pose[3]))) if belief.free[at + 3] else None,
         clock_offset_m=float(belief.mean[n - 2]) if belief.free[n - 2] else None,
-        covariance=belief.covariance[np.ix_(own, own)],
+        covariance=covariance,
         source=source,
     )

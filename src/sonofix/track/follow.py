@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, link, row_times
+from sonofix.geometry import Links, link, open_arms, row_times
 from sonofix.locate.fix import fix
 from sonofix.locate.rows import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
@@ -17,6 +17,10 @@ from sonofix.track.update import update
 
 PATIENCE = 3
 """Epochs in which most rows are refused before the track is put where the ranges say."""
+
+CONTRADICTED = 30.0
+"""Squared distance of a fix from the track, over its expected value per axis, at which the fix is followed at once:
+noise alone comes there once in three million epochs."""
 
 DOUBT_RATE = 0.05
 """How fast the variance of stated ranges is scaled, per range."""
@@ -41,6 +45,7 @@ class Follower:
         self.motion = motion or Motion()
         self.free_running = free_running
         self.belief = blank(site)
+        self._arms = open_arms(site)
         self._refused = np.zeros(len(site.vehicles), int)
         self._heard = np.zeros(len(site.vehicles), bool)
         self._recent: list[RangeEpoch] = []
@@ -51,6 +56,9 @@ class Follower:
         """Place a vehicle at a pose known beforehand."""
         who = [v.id for v in self.site.vehicles].index(vehicle)
         known = self.site.vehicles[who].z_m is not None
+        cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+        x, y = self._arms[who]
+        position_m = position_m + np.array([cos * x - sin * y, sin * x + cos * y, 0.0])
         self.belief = start_at(replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known)
 
     def step(
@@ -133,7 +141,7 @@ class Follower:
         """Give positions to vehicles that have none, or whose track refuses what is heard; return the rows that did."""
         taken = np.zeros(len(links), bool)
         for who, found in enumerate(fixes):
-            lost = self._refused[who] >= PATIENCE
+            lost = self._refused[who] >= PATIENCE or self._contradicted(who, found)
             if self.belief.placed[who] and not lost:
                 continue
             start = found
@@ -142,13 +150,25 @@ class Follower:
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
-            self.belief = predict(place(aged, who, start), self.belief.time_s, self.motion)
+            self.belief = predict(place(aged, who, start, self._arms[who]), self.belief.time_s, self.motion)
             self._refused[who], self._heard[who] = 0, True
             taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
             events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
         return taken
+
+    def _contradicted(self, who: int, found: Fix) -> bool:
+        """Whether a fix with ranges to check by says that a vehicle is not at all where its track has it."""
+        position = found.position_m
+        if not self.belief.placed[who] or found.status != "ok" or position is None or found.covariance is None:
+            return False
+        if np.sum(found.used) <= len([s for s in found.states if s in ("x", "y", "z", "yaw", "clock")]):
+            return False
+        here = estimate(predict(self.belief, found.time_s, self.motion), self.site, who, "predicted")
+        apart = position[:2] - here.position_m[:2]
+        spread = here.covariance[:2, :2] + found.covariance[:2, :2]
+        return bool(apart @ np.linalg.solve(spread, apart) > CONTRADICTED)
 
     def _gathered(self, vehicle: str) -> Fix:
         """Return a fix from the latest range of each pair within some seconds."""

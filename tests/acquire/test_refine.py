@@ -1,0 +1,177 @@
+"""The joint refinement: kernel against plain twin, derivatives against differences, recovery, and Fisher's bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sonofix.acquire.baseband import band_limited, design_band
+from sonofix.acquire.refine import Burst, burst_columns, gram, refine
+from sonofix.records import Floats
+from sonofix.signals import codes
+from sonofix.signals.interpolate import sample
+from sonofix.signals.waveform import keyed_waveform
+from sonofix.site import Signal
+
+SIGNAL = Signal(carrier_hz=15e3, cycles_per_chip=8, bandwidth_hz=3e3)
+BAND = design_band([keyed_waveform(codes.m_sequence(6, [5]), SIGNAL)], 48e3)
+A, B, C = (
+    band_limited(keyed_waveform(codes.m_sequence(6, list(taps)), SIGNAL), BAND) for taps in codes.primitive_taps(6)[:3]
+)
+RATE_HZ = BAND.rate_hz
+START_S = 1.234
+COUNT = int(0.1 * RATE_HZ)
+KAPPA_SD = 6e-3
+
+
+def model(burst: Burst) -> NDArray[np.complex128]:
+    """Plain twin of the model: the burst's own time by its definition, the carrier's phase from the same time."""
+    w = burst.waveform
+    u = START_S + np.arange(COUNT) / RATE_HZ - burst.arrival_s
+    tau = w.duration_s / 2 + u - burst.beta * u - burst.kappa / 2 * u**2
+    envelope = sample(w.envelope, w.rate_hz, w.start_s, tau)
+    # against a carrier that is at rest, which base band has taken away
+    return burst.gain * envelope * np.exp(2j * np.pi * w.carrier_hz * (tau - w.duration_s / 2 - u))
+
+
+def columns_of(burst: Burst) -> NDArray[np.complex128]:
+    return burst_columns(burst, START_S, RATE_HZ, COUNT)
+
+
+BURSTS = (
+    Burst(A, START_S + 0.0431, 0.0021, 0.004, 0.4 - 0.3j),
+    Burst(B, START_S + 0.0502, -0.0067, -0.002, 0.05 + 0.1j),
+    Burst(C, START_S + 0.0440, 0.0, 0.0, -0.8j),
+)
+
+
+@pytest.mark.parametrize("burst", BURSTS)
+def test_kernel_is_its_plain_twin(burst: Burst) -> None:
+    np.testing.assert_allclose(columns_of(burst)[0], model(replace(burst, gain=1.0)), atol=1e-12)
+
+
+@pytest.mark.parametrize("burst", BURSTS)
+@pytest.mark.parametrize(("row", "name", "step"), [(1, "arrival_s", 1e-9), (2, "beta", 1e-8), (3, "kappa", 1e-6)])
+def test_derivatives_are_differences(burst: Burst, row: int, name: str, step: float) -> None:
+    unit = replace(burst, gain=1.0)
+    here = getattr(unit, name)
+    ahead, behind = (model(replace(unit, **{name: here + s})) for s in (step, -step))
+    slow, fast = (ahead - behind) / (2 * step), columns_of(burst)[row]
+    # a cubic's slope jumps from piece to piece, by some 1e-4 of the largest
+    np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-3 * np.abs(slow).max())
+
+
+@pytest.mark.parametrize("length", [1, 511, 512, 3000])
+def test_gram_kernel_is_a_matrix_product(length: int, rng: np.random.Generator) -> None:
+    rows = rng.standard_normal((7, length))
+    np.testing.assert_allclose(gram(rows), rows @ rows.T, rtol=1e-10, atol=1e-10)
+
+
+def test_nothing_sounds_outside_the_table() -> None:
+    assert not columns_of(replace(BURSTS[0], arrival_s=START_S + 9.0)).any()
+
+
+def settled(
+    heard: NDArray[np.complex128], starts: list[Burst], whiteness: float = 1.0, kappa_sd: float = KAPPA_SD
+) -> tuple[list[Burst], list[Floats], NDArray[np.complexfloating], Floats]:
+    """Roughly, then fully: the weight of κ's prior follows from what remains when a refinement begins."""
+    rough = refine(heard, START_S, RATE_HZ, starts, kappa_sd, whiteness, 8)[0]
+    return refine(heard, START_S, RATE_HZ, rough, kappa_sd, whiteness, 20)
+
+
+def off(burst: Burst, rng: np.random.Generator) -> Burst:
+    """As a search leaves it: half a sample and half a cell of range rate off, curvature and gain not known."""
+    arrival_s = burst.arrival_s + rng.uniform(-0.5, 0.5) / RATE_HZ
+    return Burst(burst.waveform, arrival_s, burst.beta + rng.uniform(-1, 1) * 8e-4, 0.0, 0j)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_noiseless_bursts_are_recovered(count: int, rng: np.random.Generator) -> None:
+    # κ is held by its prior, which without noise weighs nothing
+    truth = list(BURSTS[:count])
+    heard = np.sum([model(b) for b in truth], axis=0)
+    found, _, residual, _ = settled(heard, [off(b, rng) for b in truth])
+    for burst, true in zip(found, truth, strict=True):
+        assert burst.arrival_s == pytest.approx(true.arrival_s, abs=1e-9)
+        assert burst.beta == pytest.approx(true.beta, abs=1e-7)
+        assert burst.kappa == pytest.approx(true.kappa, abs=1e-5)
+        assert abs(burst.gain - true.gain) < 1e-5
+    assert np.linalg.norm(residual) < 1e-5 * np.linalg.norm(heard)
+
+
+def test_an_echo_of_the_same_code_is_told_apart(rng: np.random.Generator) -> None:
+    direct = Burst(A, START_S + 0.04, 0.001, 0.0, 0.3 + 0j)
+    echo = Burst(A, START_S + 0.04 + 1.1e-3, -0.001, 0.0, 0.2j)
+    found, _, _, _ = settled(model(direct) + model(echo), [off(direct, rng), off(echo, rng)])
+    for burst, true in zip(found, (direct, echo), strict=True):
+        assert burst.arrival_s == pytest.approx(true.arrival_s, abs=1e-8)
+        assert burst.beta == pytest.approx(true.beta, abs=1e-7)
+        assert abs(burst.gain - true.gain) < 1e-4
+
+
+def noisy(rng: np.random.Generator, power: float) -> NDArray[np.complex128]:
+    return np.sqrt(power / 2) * (rng.standard_normal(COUNT) + 1j * rng.standard_normal(COUNT))
+
+
+def fisher_covariance(bursts: list[Burst], power: float) -> Floats:
+    """Inverse information about (Re g, Im g, arrival, β, κ) of each burst, by differences of the plain twin."""
+    steps = {"arrival_s": 1e-7, "beta": 1e-7, "kappa": 1e-5}
+    rows = []
+    for burst in bursts:
+        rows += [model(replace(burst, gain=1.0)), 1j * model(replace(burst, gain=1.0))]
+        for name, step in steps.items():
+            here = getattr(burst, name)
+            ahead, behind = (model(replace(burst, **{name: here + s})) for s in (step, -step))
+            rows.append((ahead - behind) / (2 * step))
+    jacobian = np.array(rows)
+    information = 2 / power * (np.conj(jacobian) @ jacobian.T).real
+    kappa = 5 * np.arange(len(bursts)) + 4
+    information[kappa, kappa] += 1 / KAPPA_SD**2
+    scale = np.sqrt(np.diag(information))
+    return np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_covariance_is_the_inverse_of_fishers_information(count: int, rng: np.random.Generator) -> None:
+    truth = list(BURSTS[:count])
+    heard = np.sum([model(b) for b in truth], axis=0) + noisy(rng, 1e-4)
+    found, covariances, _, noise = settled(heard, [off(b, rng) for b in truth])
+    sounding = np.sum(np.abs(columns_of(truth[0])[0]) > 0)
+    # noise is measured on what remains, from which 5 of 2n degrees of freedom a burst went into the fit
+    np.testing.assert_allclose(noise, 1e-4, rtol=5 / np.sqrt(sounding) + 5 * count / (2 * sounding))
+    for i, covariance in enumerate(covariances):
+        expected = fisher_covariance(found, float(noise[i]))[5 * i + 2 : 5 * i + 4, 5 * i + 2 : 5 * i + 4]
+        np.testing.assert_allclose(covariance, expected, rtol=2e-3, atol=2e-3 * np.sqrt(np.prod(np.diag(expected))))
+
+
+def test_whiteness_scales_the_noise(rng: np.random.Generator) -> None:
+    heard = model(BURSTS[0]) + noisy(rng, 1e-4)
+    once, twice = (settled(heard, [off(BURSTS[0], rng)], w) for w in (1.0, 1.5))
+    assert twice[3][0] == pytest.approx(1.5 * once[3][0], rel=1e-3)
+
+
+def test_curvature_is_held_to_what_is_plausible(rng: np.random.Generator) -> None:
+    """In loud noise κ stays within its prior; the data alone would scatter ten times as far."""
+    kappas, free = [], []
+    for _ in range(30):
+        heard = model(replace(BURSTS[0], kappa=0.0, gain=1.0)) + noisy(rng, 5.0)
+        start = [replace(off(BURSTS[0], rng), arrival_s=BURSTS[0].arrival_s, beta=BURSTS[0].beta)]
+        kappas.append(settled(heard, start)[0][0].kappa)
+        free.append(settled(heard, start, kappa_sd=1e3)[0][0].kappa)
+    assert np.std(kappas) < KAPPA_SD
+    assert np.std(free) > 3 * np.std(kappas)
+
+
+def test_misfit_never_grows(rng: np.random.Generator) -> None:
+    """Steps that would raise it are damped instead: however far the start, no more remains than there."""
+    heard = model(BURSTS[0]) + model(BURSTS[2]) + noisy(rng, 1e-3)
+    for _ in range(10):
+        start = [
+            replace(b, arrival_s=b.arrival_s + rng.normal(0, 1e-3), beta=b.beta + rng.normal(0, 3e-3))
+            for b in (BURSTS[0], BURSTS[2])
+        ]
+        before, after = (refine(heard, START_S, RATE_HZ, start, 1e3, 1.0, n)[2] for n in (0, 12))
+        assert np.linalg.norm(after) <= np.linalg.norm(before) * (1 + 1e-9)

@@ -1,0 +1,170 @@
+"""How a belief ages and begins: against numerical integrals of the same motion, and by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from locate.made_epochs import HALL, Drive, make_epoch, make_site
+from sonofix.geometry import POSE
+from sonofix.locate.fix import fix
+from sonofix.records import Floats
+from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, start_at
+
+MOTION = Motion(acceleration_psd=0.7, climb_psd=0.03, turn_psd=0.2, clock_psd=3e-6)
+PLACE = (3.0, 5.5, 1.1)
+TWO_ARMS = ((0.35, 0.1, 0.5), (-0.3, -0.2, 0.5))
+
+
+def full_belief(rng: np.random.Generator, vehicles: int = 1) -> Belief:
+    """Everything estimated, correlated at random."""
+    n = len(POSE) * vehicles + 2
+    half = rng.standard_normal((n, n))
+    return Belief(2.0, rng.standard_normal(n), half @ half.T, np.ones(n, bool), np.ones(vehicles, bool))
+
+
+def dynamics(vehicles: int) -> tuple[Floats, Floats]:
+    """F and Q of ẋ = F x + w by hand: places are driven by speeds, speeds by white noise."""
+    n = len(POSE) * vehicles + 2
+    drift, psd = np.zeros((n, n)), np.zeros(n)
+    for v in range(vehicles):
+        for i in range(4):
+            drift[8 * v + i, 8 * v + 4 + i] = 1.0
+        psd[8 * v + 4 : 8 * v + 8] = MOTION.acceleration_psd, MOTION.acceleration_psd, MOTION.climb_psd, MOTION.turn_psd
+    drift[-2, -1], psd[-1] = 1.0, MOTION.clock_psd
+    return drift, np.diag(psd)
+
+
+@pytest.mark.parametrize("dt_s", [0.02, 0.5, 3.0])
+@pytest.mark.parametrize("vehicles", [1, 2])
+def test_prediction_equals_van_loans_integral(dt_s: float, vehicles: int, rng: np.random.Generator) -> None:
+    # Van Loan, IEEE Trans. Automatic Control 23(3), 1978: one matrix exponential holds transition and noise
+    belief = full_belief(rng, vehicles)
+    drift, psd = dynamics(vehicles)
+    n = len(drift)
+    block = expm(np.block([[-drift, psd], [np.zeros((n, n)), drift.T]]) * dt_s)
+    transition = block[n:, n:].T
+    noise = transition @ block[:n, n:]
+    aged = predict(belief, belief.time_s + dt_s, MOTION)
+    np.testing.assert_allclose(aged.mean, transition @ belief.mean, atol=1e-12)
+    np.testing.assert_allclose(aged.covariance, transition @ belief.covariance @ transition.T + noise, atol=1e-10)
+    assert aged.time_s == belief.time_s + dt_s
+
+
+def test_prediction_equals_many_small_random_steps(rng: np.random.Generator) -> None:
+    # the noise is what white acceleration, summed in small steps, does to 4000 vehicles
+    steps, runs, dt = 200, 4000, 1.0 / 200
+    kick = np.sqrt(MOTION.acceleration_psd * dt) * rng.standard_normal((steps, runs))
+    speed = np.cumsum(kick, axis=0)
+    place_m = np.sum(speed - kick / 2, axis=0) * dt
+    sample = np.cov(np.vstack([place_m, speed[-1]]))
+    belief = full_belief(rng)
+    still = replace(belief, mean=0 * belief.mean, covariance=0 * belief.covariance)
+    aged = predict(still, belief.time_s + 1.0, MOTION)
+    # a variance from 4000 samples is good to √(2/4000) = 2.2 %: four of those
+    np.testing.assert_allclose(sample, aged.covariance[np.ix_([0, 4], [0, 4])], rtol=0.09)
+
+
+def test_two_short_predictions_equal_one_long(rng: np.random.Generator) -> None:
+    belief = full_belief(rng, 2)
+    once = predict(belief, 3.1, MOTION)
+    twice = predict(predict(belief, 2.4, MOTION), 3.1, MOTION)
+    np.testing.assert_allclose(twice.mean, once.mean, atol=1e-12)
+    np.testing.assert_allclose(twice.covariance, once.covariance, atol=1e-10)
+
+
+def test_no_time_changes_nothing(rng: np.random.Generator) -> None:
+    belief = full_belief(rng)
+    same = predict(belief, belief.time_s, MOTION)
+    np.testing.assert_array_equal(same.mean, belief.mean)
+    np.testing.assert_array_equal(same.covariance, belief.covariance)
+
+
+def test_looking_back_also_costs_certainty(rng: np.random.Generator) -> None:
+    belief = full_belief(rng)
+    back = predict(belief, belief.time_s - 0.3, MOTION)
+    there_and_back = predict(back, belief.time_s, MOTION)
+    np.testing.assert_allclose(there_and_back.mean, belief.mean, atol=1e-12)
+    gained = np.linalg.eigvalsh(there_and_back.covariance - belief.covariance)
+    assert gained.min() > -1e-12
+    assert gained.max() > 0
+
+
+def test_a_known_level_never_becomes_uncertain() -> None:
+    site = make_site(HALL, level_m=1.1)
+    belief = place(blank(site), 0, fix(make_epoch(site, Drive(PLACE)), site, "v"))
+    aged = predict(belief, 60.0, MOTION)
+    assert aged.mean[2] == 1.1
+    for i in (2, 3, 6, 7):
+        assert not aged.covariance[i].any()
+        assert not aged.covariance[:, i].any()
+
+
+def test_nothing_is_believed_before_anything_is_heard() -> None:
+    site = make_site(HALL, level_m=1.1)
+    belief = predict(blank(site), 5.0, MOTION)
+    assert belief.time_s == 5.0
+    assert not belief.placed.any()
+    assert not belief.free.any()
+    assert belief.pose()[0, 2] == 1.1
+
+
+@pytest.mark.parametrize("clock_m", [None, 20.0])
+@pytest.mark.parametrize("rate_sd_mps", [None, 0.05])
+def test_a_fix_is_taken_over_as_it_is(clock_m: float | None, rate_sd_mps: float | None) -> None:
+    site = make_site(HALL, arms_m=TWO_ARMS)
+    drive = Drive(PLACE, (0.4, -0.2, 0.1) if rate_sd_mps else (0.0, 0.0, 0.0), yaw_rad=0.7)
+    found = fix(make_epoch(site, drive, clock_m=clock_m, rate_sd_mps=rate_sd_mps), site, "v")
+    assert found.status == "ok"
+    got = estimate(place(blank(site), 0, found), site, 0, "fix")
+    np.testing.assert_array_equal(got.position_m, found.position_m)
+    assert got.yaw_rad == pytest.approx(0.7, abs=1e-4)
+    for state in ("x", "y", "z", "yaw", *(("clock",) if clock_m else ()), *(("vx", "vy", "vz") if rate_sd_mps else ())):
+        assert got.sd(state) == pytest.approx(found.sd(state), rel=1e-12), state
+    if rate_sd_mps is None:
+        # unknown speeds start at rest, good to 1 m/s
+        np.testing.assert_array_equal(got.velocity_mps, 0.0)
+        assert [got.sd(s) for s in ("vx", "vy", "vz")] == [1.0] * 3
+    assert (got.clock_offset_m is None) == (clock_m is None)
+    assert got.source == "fix"
+    assert got.vehicle == "v"
+
+
+def test_placing_forgets_what_was_believed_of_that_vehicle_alone(rng: np.random.Generator) -> None:
+    site = make_site(HALL)
+    found = fix(make_epoch(site, Drive(PLACE)), site, "v")
+    belief = full_belief(rng, 2)
+    placed = place(belief, 0, found)
+    np.testing.assert_array_equal(placed.mean[8:], belief.mean[8:])
+    np.testing.assert_array_equal(placed.covariance[8:, 8:], belief.covariance[8:, 8:])
+    assert not placed.covariance[:8, 8:].any()
+    assert np.linalg.eigvalsh(placed.covariance).min() > -1e-9
+
+
+def test_a_fix_without_a_position_cannot_place() -> None:
+    site = make_site(HALL[:2])
+    found = fix(make_epoch(site, Drive(PLACE)), site, "v")
+    with pytest.raises(ValueError, match="too-few"):
+        place(blank(site), 0, found)
+
+
+@pytest.mark.parametrize("level_known", [True, False])
+def test_a_stated_start_is_good_to_five_centimetres(level_known: bool) -> None:
+    site = make_site(HALL, level_m=1.1 if level_known else None)
+    got = estimate(start_at(blank(site), 0, np.array(PLACE), 0.5, level_known), site, 0, "predicted")
+    np.testing.assert_array_equal(got.position_m, PLACE)
+    assert got.sd("x") == got.sd("y") == pytest.approx(0.05)
+    assert got.sd("z") == (None if level_known else pytest.approx(0.05))
+    assert got.sd("vx") == pytest.approx(0.5)
+    assert got.states == (("x", "y", "vx", "vy") if level_known else ("x", "y", "z", "vx", "vy", "vz"))
+
+
+def test_an_estimates_heading_lies_between_minus_pi_and_pi(rng: np.random.Generator) -> None:
+    site = make_site(HALL)
+    belief = full_belief(rng)
+    mean = belief.mean.copy()
+    mean[3] = 7.0
+    assert estimate(replace(belief, mean=mean), site, 0, "fused").yaw_rad == pytest.approx(7.0 - 2 * np.pi)
