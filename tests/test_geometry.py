@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from sonofix.geometry import POSE, Links, link, model, row_times
+from sonofix.geometry import POSE, Links, from_arm, link, model, open_arms, row_times, turning
 from sonofix.records import Floats
 from sonofix.site import Site
 
@@ -211,6 +211,7 @@ def make_site() -> Site:
             "microphone": [
                 {"id": "ear", "vehicle": "a", "lever_arm_m": [0.4, 0.0, 0.5]},
                 {"id": "post", "position_m": [0.0, 0.0, 0.0]},
+                {"id": "rear", "vehicle": "b", "lever_arm_m": [-0.4, 0.0, 0.2]},
             ],
         }
     )
@@ -221,8 +222,9 @@ def test_link_finds_both_ends_of_each_row() -> None:
     assert links.emitter_vehicle.tolist() == [-1, 1, 1]
     assert links.receiver_vehicle.tolist() == [0, -1, 0]
     assert links.emitter_point.tolist() == [[1.0, 2.0, 3.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3]]
-    # a microphone at the frame's very origin is fixed there, and not taken for a lever arm
-    assert links.receiver_point.tolist() == [[0.4, 0.0, 0.5], [0.0, 0.0, 0.0], [0.4, 0.0, 0.5]]
+    # a microphone at the frame's very origin is fixed there, and not taken for a lever arm; of a vehicle's only end,
+    # whose heading nothing tells, the horizontal arm is left out: the motion is followed there
+    assert links.receiver_point.tolist() == [[0.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.5]]
     assert links.emitter_sd_m.tolist() == [0.02, 0.0, 0.0]
     assert len(links) == 3
 
@@ -234,11 +236,43 @@ def test_link_of_no_rows_is_empty() -> None:
 
 
 @pytest.mark.parametrize(
-    ("emitter", "receiver", "named"), [("well", "ear", "wall, horn"), ("wall", "eye", "ear, post")]
+    ("emitter", "receiver", "named"), [("well", "ear", "wall, horn"), ("wall", "eye", "ear, post, rear")]
 )
 def test_link_names_an_unknown_id_and_those_that_exist(emitter: str, receiver: str, named: str) -> None:
     with pytest.raises(KeyError, match=named):
         link(make_site(), (emitter,), (receiver,))
+
+
+def test_a_lone_end_tells_no_heading_and_leaves_its_arm_open() -> None:
+    site = make_site()
+    assert turning(site).tolist() == [False, True]
+    np.testing.assert_array_equal(open_arms(site), [[0.4, 0.0], [0.0, 0.0]])
+    mast = Site.model_validate(
+        {
+            "vehicle": [{"id": "a"}, {"id": "b"}],
+            "beacon": [{"id": "low", "vehicle": "a", "lever_arm_m": [0.2, 0.1, 0.3]}],
+            "microphone": [{"id": "high", "vehicle": "a", "lever_arm_m": [0.2, 0.1, 1.3]}],
+        }
+    )
+    # two ends above each other are as one; a vehicle without ends has nothing open
+    assert turning(mast).tolist() == [False, False]
+    np.testing.assert_array_equal(open_arms(mast), [[0.2, 0.1], [0.0, 0.0]])
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 1.1, -2.5])
+def test_an_open_arm_lies_the_way_the_vehicle_drives(yaw_rad: float) -> None:
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    arm = np.array([0.3, -0.2])
+    shift, sd_m = from_arm(arm, 0.8 * np.array([cos, sin, 0.0]))
+    np.testing.assert_allclose(shift, -np.array([[cos, -sin], [sin, cos]]) @ arm, atol=1e-15)
+    assert sd_m == pytest.approx(0.1 * np.hypot(0.3, 0.2))
+
+
+def test_an_open_arm_of_a_standing_vehicle_may_lie_any_way() -> None:
+    shift, sd_m = from_arm(np.array([0.3, -0.4]), np.array([0.0, 0.0, 2.0]))
+    np.testing.assert_array_equal(shift, 0.0)
+    assert sd_m == pytest.approx(0.5)
+    assert from_arm(np.zeros(2), np.array([1.0, 0.0, 0.0]))[1] == 0.0
 
 
 @pytest.mark.parametrize("keep", [np.array([2, 0]), np.array([True, False, True])])

@@ -125,7 +125,7 @@ def test_a_sweep_ends_where_a_pair_comes_again() -> None:
         (0.3, "B", "w", 2.1),
         (0.4, "B", "v", 2.2),
     ]
-    epochs = stated_epochs(rows_of(rows), SPEED)
+    epochs = stated_epochs(rows_of(rows), site_of())
     assert [e.emitter for e in epochs] == [("A", "B"), ("A", "B", "B")]
     assert [e.receiver for e in epochs] == [("v", "v"), ("v", "w", "v")]
     assert [e.index for e in epochs] == [0, 1]
@@ -138,7 +138,7 @@ def test_a_sweep_ends_where_a_pair_comes_again() -> None:
 
 def test_a_sweep_is_no_longer_than_a_second() -> None:
     rows = [(0.7 * i, name, "v", 1.0) for i, name in enumerate("ABCDEF")]
-    epochs = stated_epochs(rows_of(rows), SPEED)
+    epochs = stated_epochs(rows_of(rows), site_of())
     assert [e.emitter for e in epochs] == [("A", "B"), ("C", "D"), ("E", "F")]
     assert all(np.ptp(e.time_s) <= SWEEP_S for e in epochs)
 
@@ -147,7 +147,7 @@ def test_every_row_is_in_one_epoch_whatever_their_order(rng: np.random.Generator
     rows = [
         (float(t), "ABC"[rng.integers(3)], "vw"[rng.integers(2)], float(i)) for i, t in enumerate(rng.uniform(0, 9, 80))
     ]
-    epochs = stated_epochs(rows_of(rows), SPEED)
+    epochs = stated_epochs(rows_of(rows), site_of())
     assert sorted(r for e in epochs for r in e.range_m) == [float(i) for i in range(80)]
     times = np.concatenate([e.time_s for e in epochs])
     assert (np.diff(times) >= 0).all()
@@ -156,12 +156,12 @@ def test_every_row_is_in_one_epoch_whatever_their_order(rng: np.random.Generator
 
 def test_deviations_are_as_stated_or_that_of_radio() -> None:
     rows = [(0.0, "A", "v", 1.0), (0.1, "B", "v", 2.0)]
-    (some,) = stated_epochs(rows_of(rows, [0.02, np.nan]), SPEED)
+    (some,) = stated_epochs(rows_of(rows, [0.02, np.nan]), site_of())
     np.testing.assert_allclose(some.covariance_m2, np.diag([0.02**2, RANGES_WITHOUT_SD_M**2]))
-    (none,) = stated_epochs(rows_of(rows), SPEED)
+    (none,) = stated_epochs(rows_of(rows), site_of())
     np.testing.assert_allclose(none.covariance_m2, np.diag([RANGES_WITHOUT_SD_M**2] * 2))
 
 
 def test_no_rows_are_no_epochs() -> None:
     empty = RangeRows(np.zeros(0), (), (), np.zeros(0), None)
-    assert stated_epochs(empty, SPEED) == []
+    assert stated_epochs(empty, site_of()) == []

@@ -62,7 +62,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
         yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
     elif recording.ranges is not None:
         street = Street(recording.site, recording.tables.get("start"), rate_hz)
-        for epoch in stated_epochs(recording.ranges, recording.site.sound_speed_mps):
+        for epoch in stated_epochs(recording.ranges, recording.site):
             yield street.walk(epoch)
     else:
         raise ValueError("the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv")
@@ -105,9 +105,7 @@ class Street:
     def __init__(self, site: Site, start: Table | None = None, rate_hz: float | None = None) -> None:
         self.site = site
         self.rate_hz = rate_hz
-        emitters = {b.vehicle for b in site.coded_beacons}
-        free_running = site.schedule is not None and not site.schedule.synchronised and None not in emitters
-        self.follower = Follower(site, Motion(), free_running)
+        self.follower = Follower(site, Motion(), site.free_running)
         self._start = start
         self._written_s: float | None = None
 
@@ -205,8 +203,7 @@ class Receiver:
         self._plan = make_plan(
             waveforms, sample_rate_hz, self.sound_speed_mps, max(speeds) * (2.0 if sounding else 1.0)
         )
-        known = site.schedule.synchronised
-        regular = any(b.vehicle is None for b in site.coded_beacons)
+        known, regular = site.schedule.synchronised, not site.free_running
         self._schedule = Schedule(site.schedule.period_s, reach_s(site, self.sound_speed_mps), sync_s, known, regular)
         self._street = Street(site, start, rate_hz)
         self._offsets_s = {b.id: b.offset_s + b.delay_s for b in site.coded_beacons}
@@ -324,7 +321,7 @@ class Receiver:
             aged, self.site, [(e, receiver) for e in emitters], self.sound_speed_mps
         )
         c = self.sound_speed_mps
-        common = self.site.schedule is not None and not self.site.schedule.synchronised
+        common = not self.site.clock_known
         offset_m = float(belief.mean[-2]) if common else 0.0
         # a free-running source keeps no time from burst to burst, only its speed carries over
         loose_s = 1.0 if self._street.follower.free_running else (1e-3 if common else 2e-4)

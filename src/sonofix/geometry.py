@@ -67,11 +67,21 @@ def open_arms(site: Site) -> Floats:
     `from_arm` goes back to its origin.
     """
     arms = np.zeros((len(site.vehicles), 2))
+    turns = turning(site)
     for i, vehicle in enumerate(site.vehicles):
         ends = [n.lever_arm_m[:2] for n in (*site.beacons, *site.microphones) if n.vehicle == vehicle.id]
-        if ends and all(np.hypot(e[0] - ends[0][0], e[1] - ends[0][1]) < SAME_ARM_M for e in ends):
+        if ends and not turns[i]:
             arms[i] = ends[0]
     return arms
+
+
+def turning(site: Site) -> NDArray[np.bool_]:
+    """Whether each vehicle's ends tell its heading (V,): they sit on more than one vertical line."""
+    out = np.zeros(len(site.vehicles), bool)
+    for i, vehicle in enumerate(site.vehicles):
+        ends = np.array([n.lever_arm_m[:2] for n in (*site.beacons, *site.microphones) if n.vehicle == vehicle.id])
+        out[i] = len(ends) > 0 and bool(np.any(np.hypot(*(ends - ends[0]).T) >= SAME_ARM_M))
+    return out
 
 
 def from_arm(arm: Floats, velocity: Floats) -> tuple[Floats, float]:

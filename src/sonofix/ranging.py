@@ -40,7 +40,7 @@ def range_epoch(
     own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2
     rate = sound_speed_mps * (1.0 - np.array([d.time_scale for d in heard]))
     rate_sd = sound_speed_mps * np.sqrt([d.covariance[1, 1] for d in heard])
-    common_clock = site.schedule is not None and not site.schedule.synchronised
+    common_clock = not site.clock_known
     # with an unknown offset inside, the flight is not known: the spread of ranges is what the speed's error scales
     flight_m = range_m - range_m.min(initial=np.inf) if common_clock and len(heard) else range_m
     shared = (sound_speed_sd_mps / sound_speed_mps) ** 2 * np.outer(flight_m, flight_m)
@@ -61,7 +61,7 @@ def range_epoch(
     )
 
 
-def stated_epochs(rows: RangeRows, sound_speed_mps: float) -> list[RangeEpoch]:
+def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
     """Epochs of ranges that a recording states: one sweep over the pairs each, until a pair comes again."""
     epochs: list[RangeEpoch] = []
     order = np.argsort(rows.time_s, kind="stable")
@@ -83,8 +83,8 @@ def stated_epochs(rows: RangeRows, sound_speed_mps: float) -> list[RangeEpoch]:
                 range_rate_mps=None,
                 range_rate_sd_mps=None,
                 snr_db=None,
-                clock="known",
-                sound_speed_mps=sound_speed_mps,
+                clock="known" if site.clock_known else "common",
+                sound_speed_mps=site.sound_speed_mps,
             )
         )
 

@@ -369,6 +369,21 @@ class Site(_Section):
         return air.sound_speed_mps(self.air.temperature_c, self.air.humidity, self.air.pressure_kpa)
 
     @property
+    def clock_known(self) -> bool:
+        """Whether the moments of sending are known on the recorder's clock, so that ranges are not just differences.
+
+        They are not where bursts start at no sync command, nor where a recorded reference states no distance.
+        """
+        unplaced = any(isinstance(b.code, ReferenceCode) and b.code.distance_m is None for b in self.beacons)
+        return not unplaced and (self.schedule is None or self.schedule.synchronised)
+
+    @property
+    def free_running(self) -> bool:
+        """Whether every burst has an offset of its own: beacons that only ride on vehicles, on their own clocks."""
+        unsynchronised = self.schedule is not None and not self.schedule.synchronised
+        return unsynchronised and all(b.vehicle is not None for b in self.coded_beacons or self.beacons)
+
+    @property
     def coded_beacons(self) -> tuple[Beacon, ...]:
         """The beacons that take part in reading samples."""
         return tuple(beacon for beacon in self.beacons if beacon.code is not None)

@@ -16,6 +16,7 @@ from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict
 
 MOTION = Motion(acceleration_psd=0.7, climb_psd=0.03, turn_psd=0.2, clock_psd=3e-6)
 PLACE = (3.0, 5.5, 1.1)
+NO_ARM = np.zeros(2)
 TWO_ARMS = ((0.35, 0.1, 0.5), (-0.3, -0.2, 0.5))
 
 
@@ -95,7 +96,7 @@ def test_looking_back_also_costs_certainty(rng: np.random.Generator) -> None:
 
 def test_a_known_level_never_becomes_uncertain() -> None:
     site = make_site(HALL, level_m=1.1)
-    belief = place(blank(site), 0, fix(make_epoch(site, Drive(PLACE)), site, "v"))
+    belief = place(blank(site), 0, fix(make_epoch(site, Drive(PLACE)), site, "v"), NO_ARM)
     aged = predict(belief, 60.0, MOTION)
     assert aged.mean[2] == 1.1
     for i in (2, 3, 6, 7):
@@ -119,7 +120,7 @@ def test_a_fix_is_taken_over_as_it_is(clock_m: float | None, rate_sd_mps: float 
     drive = Drive(PLACE, (0.4, -0.2, 0.1) if rate_sd_mps else (0.0, 0.0, 0.0), yaw_rad=0.7)
     found = fix(make_epoch(site, drive, clock_m=clock_m, rate_sd_mps=rate_sd_mps), site, "v")
     assert found.status == "ok"
-    got = estimate(place(blank(site), 0, found), site, 0, "fix")
+    got = estimate(place(blank(site), 0, found, NO_ARM), site, 0, "fix")
     np.testing.assert_array_equal(got.position_m, found.position_m)
     assert got.yaw_rad == pytest.approx(0.7, abs=1e-4)
     for state in ("x", "y", "z", "yaw", *(("clock",) if clock_m else ()), *(("vx", "vy", "vz") if rate_sd_mps else ())):
@@ -137,7 +138,7 @@ def test_placing_forgets_what_was_believed_of_that_vehicle_alone(rng: np.random.
     site = make_site(HALL)
     found = fix(make_epoch(site, Drive(PLACE)), site, "v")
     belief = full_belief(rng, 2)
-    placed = place(belief, 0, found)
+    placed = place(belief, 0, found, NO_ARM)
     np.testing.assert_array_equal(placed.mean[8:], belief.mean[8:])
     np.testing.assert_array_equal(placed.covariance[8:, 8:], belief.covariance[8:, 8:])
     assert not placed.covariance[:8, 8:].any()
@@ -148,18 +149,33 @@ def test_a_fix_without_a_position_cannot_place() -> None:
     site = make_site(HALL[:2])
     found = fix(make_epoch(site, Drive(PLACE)), site, "v")
     with pytest.raises(ValueError, match="too-few"):
-        place(blank(site), 0, found)
+        place(blank(site), 0, found, NO_ARM)
 
 
+def test_an_open_arm_is_followed_at_its_end_and_told_at_the_origin() -> None:
+    # one microphone 40 cm ahead of the origin, driving north: it is followed there, and the origin lies south of it
+    site = make_site(HALL, arms_m=((0.4, 0.0, 0.5),))
+    drive = Drive(PLACE, (0.0, 0.8, 0.0), yaw_rad=np.pi / 2)
+    found = fix(make_epoch(site, drive, rate_sd_mps=0.01), site, "v")
+    belief = place(blank(site), 0, found, np.array([0.4, 0.0]))
+    np.testing.assert_allclose(belief.mean[:3], np.array(PLACE) + [0.0, 0.4, 0.0], atol=1e-4)
+    got = estimate(belief, site, 0, "fix")
+    np.testing.assert_allclose(got.position_m, PLACE, atol=1e-4)
+    # 0.1 rad of heading at 40 cm
+    assert got.sd("x") > 0.04
+
+
+@pytest.mark.parametrize("turns", [True, False])
 @pytest.mark.parametrize("level_known", [True, False])
-def test_a_stated_start_is_good_to_five_centimetres(level_known: bool) -> None:
+def test_a_stated_start_is_good_to_five_centimetres(level_known: bool, turns: bool) -> None:
     site = make_site(HALL, level_m=1.1 if level_known else None)
-    got = estimate(start_at(blank(site), 0, np.array(PLACE), 0.5, level_known), site, 0, "predicted")
+    got = estimate(start_at(blank(site), 0, np.array(PLACE), 0.5, level_known, turns), site, 0, "predicted")
     np.testing.assert_array_equal(got.position_m, PLACE)
     assert got.sd("x") == got.sd("y") == pytest.approx(0.05)
     assert got.sd("z") == (None if level_known else pytest.approx(0.05))
     assert got.sd("vx") == pytest.approx(0.5)
-    assert got.states == (("x", "y", "vx", "vy") if level_known else ("x", "y", "z", "vx", "vy", "vz"))
+    assert got.sd("yaw") == (pytest.approx(0.1) if turns else None)
+    assert got.yaw_rad == (pytest.approx(0.5) if turns else None)
 
 
 def test_an_estimates_heading_lies_between_minus_pi_and_pi(rng: np.random.Generator) -> None:

@@ -156,14 +156,19 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
 
 
-def start_at(belief: Belief, vehicle: int, position_m: Floats, yaw_rad: float, level_known: bool) -> Belief:
-    """Put a vehicle at a stated start pose, good to 5 cm; it stands still there as far as is known (0 ± 0.5 m/s)."""
+def start_at(
+    belief: Belief, vehicle: int, position_m: Floats, yaw_rad: float, level_known: bool, turns: bool
+) -> Belief:
+    """Put a vehicle at a stated start pose, good to 5 cm and 0.1 rad, at rest as far as is known (0 ± 0.5 m/s).
+
+    Its heading is followed where ``turns``: its ends do not all sit on one vertical line.
+    """
     at = SIZE * vehicle
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
     mean[at : at + 3] = position_m
     mean[at + 3] = yaw_rad
-    for i, sd in ((0, 0.05), (1, 0.05), (2, 0.05), (4, 0.5), (5, 0.5), (6, 0.5)):
-        if level_known and i in (2, 6):
+    for i, sd in enumerate((0.05, 0.05, 0.05, 0.1, 0.5, 0.5, 0.5, 0.5)):
+        if (level_known and i in (2, 6)) or (not turns and i in (3, 7)):
             continue
         free[at + i] = True
         covariance[at + i, at + i] = sd**2

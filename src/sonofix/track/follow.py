@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, link, open_arms, row_times
+from sonofix.geometry import Links, link, open_arms, row_times, turning
 from sonofix.locate.fix import fix
 from sonofix.locate.rows import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
@@ -59,7 +59,9 @@ class Follower:
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         x, y = self._arms[who]
         position_m = position_m + np.array([cos * x - sin * y, sin * x + cos * y, 0.0])
-        self.belief = start_at(replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known)
+        self.belief = start_at(
+            replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, bool(turning(self.site)[who])
+        )
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -80,7 +82,7 @@ class Follower:
         for found in fixes:
             if found.status == "ok":
                 candidates &= found.used | np.isnan(found.residual_m)
-        self._clock(epoch, links, fixes)
+        self._clock(epoch, fixes)
         self._gather(epoch)
         taken = self._place(links, fixes, events)
         stated = epoch.snr_db is None
@@ -93,11 +95,6 @@ class Follower:
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
-    def ahead(self, time_s: float) -> tuple[Estimate, ...]:
-        """Return what is expected at a later instant, by all vehicles that have a position."""
-        later = predict(self.belief, time_s, self.motion)
-        return tuple(estimate(later, self.site, int(i), "predicted") for i in np.flatnonzero(later.placed))
-
     def _time(self, epoch: RangeEpoch, links: Links) -> float:
         """Instant the epoch's state belongs to; an empty epoch takes the delay that others showed."""
         if not len(epoch):
@@ -109,10 +106,11 @@ class Follower:
         self._lag_s = time_s - epoch.sync_s
         return time_s
 
-    def _clock(self, epoch: RangeEpoch, links: Links, fixes: tuple[Fix, ...]) -> None:
-        """Forget the clock offset of a free-running source: nothing ties it to the last epoch's."""
+    def _clock(self, epoch: RangeEpoch, fixes: tuple[Fix, ...]) -> None:
+        """Open the clock offset anew where nothing ties it to the last epoch's: a free-running source, or a start."""
         belief = self.belief
-        if not (self.free_running and len(epoch) and belief.placed.any()):
+        unknown = epoch.clock == "common" and (self.free_running or not belief.free[-2])
+        if not (unknown and len(epoch) and belief.placed.any()):
             return
         known = [f.clock_offset_m for f in fixes if f.clock_offset_m is not None]
         mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
