@@ -18,11 +18,12 @@ check: $(STAMP)
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-prove: $(STAMP)  ## long statistics; prints the tables of docs/statistics.md
-	$(BIN)/python -m pytest -m prove -s tests/statistics
+prove: $(STAMP)  ## long statistics (many minutes); prints tables and renews docs/statistics.md
+	$(BIN)/python benchmarks/prove.py docs/statistics.md
 
-bench: $(STAMP)  ## benchmarks against peers and floors in the same run
-	$(BIN)/python benchmarks/street.py
+bench: $(STAMP)  ## benchmarks against peers and floors in the same run (a quarter of an hour); renews the documents' tables
+	$(BIN)/python benchmarks/street.py --into docs/benchmarks.md
+	$(BIN)/python benchmarks/accuracy.py --into README.md
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
@@ -35,7 +36,7 @@ lock:  ## renew requirements.lock (needs uv)
 $(STAMP): pyproject.toml requirements.lock
 	@if command -v uv >/dev/null 2>&1; then \
 	  test -x $(BIN)/python || uv venv --quiet --python $(PYTHON) .venv; \
-	  uv pip install --quiet --python $(BIN)/python --require-hashes -r requirements.lock; \
+	  uv pip install --quiet --compile-bytecode --python $(BIN)/python --require-hashes -r requirements.lock; \
 	  uv pip install --quiet --python $(BIN)/python --no-deps -e .; \
 	else \
 	  test -x $(BIN)/python || $(PYTHON) -m venv .venv; \

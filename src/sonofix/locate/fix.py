@@ -15,7 +15,7 @@ from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
 FLAT_M = 0.01
-"""Two heights alike to every range within this are one position with an open height."""
+"""Two heights whose middle fits every range within this, or its deviation, are one position with an open height."""
 
 AMBIGUOUS_CHI2 = 16.0
 """Two solutions whose χ² differ by less are both believed: odds of e⁸ to one."""
@@ -70,7 +70,7 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         status, inflation = "inconsistent", everything.chi2 / (solver.count(rows) - everything.jacobian.shape[1])
         remedy = "a range is wrong, but which cannot be told; bring more beacons in reach"
     rivals = [s for s in found[1:] if s.chi2 < best.chi2 + AMBIGUOUS_CHI2 * inflation]
-    best, mirror, undecided = _tell_apart(best, rivals, site, float(np.median(epoch.range_m[kept])))
+    best, mirror, undecided = _tell_apart(best, rivals, site, epoch, kept)
     if undecided:
         text = "two positions or headings fit alike; state the room's bounds_m or the vehicle's z_m, or move one beacon"
         return replace(
@@ -111,7 +111,7 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
 
 
 def _tell_apart(
-    best: Solution, rivals: list[Solution], site: Site, range_m: float
+    best: Solution, rivals: list[Solution], site: Site, epoch: RangeEpoch, kept: NDArray[np.int64]
 ) -> tuple[Solution, Solution | None, bool]:
     """Choose among solutions that fit alike by the room's bounds; say so where that does not decide.
 
@@ -121,7 +121,9 @@ def _tell_apart(
         return best, None, False
     if site.bounds_m is None:
         apart = best.pose[:3] - rivals[0].pose[:3]
-        close = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * abs(range_m)) < FLAT_M
+        range_m = abs(float(np.median(epoch.range_m[kept])))
+        seen_m = max(FLAT_M, float(np.median(np.sqrt(np.diag(epoch.covariance_m2)[kept]))))
+        close = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * range_m) < seen_m
         return best, rivals[0], len(rivals) > 1 or not close
     low, high = np.array(site.bounds_m)
     inside = [s for s in [best, *rivals] if np.all(s.pose[:3] >= low - 0.1) and np.all(s.pose[:3] <= high + 0.1)]

@@ -1,0 +1,64 @@
+"""Timing side by side, and tables."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """A job and its floor (or peer): the best time of each in s, and the median of their ratios, turn by turn."""
+
+    job_s: float
+    floor_s: float
+    ratio: float
+
+
+def beside(job: Callable[[], object], floor: Callable[[], object], turns: int) -> Beside:
+    """Time two jobs in turns, so that whatever else the machine does falls on both alike; one turn warms up."""
+    job()
+    floor()
+    times = np.array([(once(job), once(floor)) for _ in range(turns)])
+    return Beside(float(times[:, 0].min()), float(times[:, 1].min()), float(np.median(times[:, 0] / times[:, 1])))
+
+
+def once(job: Callable[[], object]) -> float:
+    """Return the wall time of one call, s."""
+    begin = time.perf_counter()
+    job()
+    return time.perf_counter() - begin
+
+
+def machine() -> str:
+    """Name the machine as far as figures depend on it."""
+    return (
+        f"{os.cpu_count()} cores, {platform.machine().replace('_', '-')}, Python {platform.python_version()}, "
+        f"NumPy {np.__version__}, one BLAS thread"
+    )
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a Markdown table under a heading."""
+    print(f"\n### {title}\n")
+    print("| " + " | ".join(columns) + " |")
+    print("|" + "---|" * len(columns))
+    for row in rows:
+        print("| " + " | ".join(row) + " |", flush=True)
+
+
+def milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.3g} ms"
+
+
+def millimetres(length_m: float) -> str:
+    return f"{1e3 * length_m:.2f} mm"
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,53 @@
+"""Run the long statistics and put the tables they print into docs/statistics.md, if all hold."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+MARK = "<!-- from here on as printed -->\n"
+
+
+def tables(printed: Sequence[str]) -> list[str]:
+    """Pick Markdown tables with the sentences right before them out of what pytest printed.
+
+    Each becomes a block: sentences, an empty line, the table. What pytest says of its own progress is left out.
+    """
+    blocks: list[str] = []
+    before: list[str] = []
+    rows: list[str] = []
+    for line in [*printed, ""]:
+        text = line.strip()
+        if text.startswith("|"):
+            rows.append(text)
+            continue
+        if rows:
+            blocks.append("\n".join([*before, *([""] if before else []), *rows]))
+            before, rows = [], []
+        if set(text) <= set(".FEsx") or text.startswith(("tests/", "=")):
+            before = before if not text else []
+        else:
+            before.append(text)
+    return blocks
+
+
+def main() -> None:
+    """Run pytest, show what it prints as it comes, and renew the page given."""
+    page = Path(sys.argv[1])
+    command = [sys.executable, "-m", "pytest", "-q", "-s", "--no-header", "-m", "prove", "tests/statistics"]
+    printed: list[str] = []
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        for line in running.stdout:
+            print(line, end="", flush=True)
+            printed.append(line)
+    if running.returncode:
+        sys.exit(running.returncode)
+    text = page.read_text("utf-8")
+    page.write_text(text[: text.index(MARK) + len(MARK)] + "\n" + "\n\n".join(tables(printed)) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()
