@@ -33,9 +33,6 @@ UNEXPLAINED = 1.3
 RESIDUE = 10 ** (-12 / 10)
 """What a poorly matched burst leaves behind is weaker than this share of it."""
 
-CROWD = 10 ** (-2 / 10)
-"""Where nothing stands out of what is left, the loudest is taken, and what is within this of it."""
-
 MOST_PATHS = 8
 """Of one burst."""
 
@@ -136,12 +133,11 @@ class Separation:
             elif warm and (disturbed or not self.sounds):
                 warm = {}
             elif disturbed or not self.sounds:
-                # nothing stands out of the crowd, if there is one: go on with its loudest
-                crowd = [(bank, p) for bank in self.banks if (p := self._look(bank, warm, True, by_margins=True))]
+                # nothing stands out of the crowd, if there is one: begin with its loudest
+                crowd = [(bank, p) for bank in self.banks if (p := self._look(bank, warm, False, by_margins=True))]
                 if not crowd:
                     break
-                loudest = max(peak.power for _, peak in crowd)
-                self._accept([(bank, peak) for bank, peak in crowd if peak.power >= CROWD * loudest])
+                self._accept([max(crowd, key=lambda found: found[1].power)])
             else:
                 break
         self._prune()
