@@ -49,7 +49,6 @@ class Rows:
         mounted = links.receiver_vehicle[rows] >= 0
         arms = np.where(mounted[:, None], links.receiver_point[rows], links.emitter_point[rows])
         flat = arms[:, :2] - arms[:1, :2]
-        self.sounding = bool(len(rows)) and not mounted.all()
         self.arm = arms.mean(axis=0) if len(rows) else np.zeros(3)
         turns = bool(len(rows)) and bool(np.any(np.hypot(flat[:, 0], flat[:, 1]) > 1e-3))
         self.free = np.array([True, True, level_m is None, turns] + [False] * 4)

@@ -39,19 +39,17 @@ def update(
     used = np.zeros(len(epoch), bool)
     placed = np.append(belief.placed, True)
     rows = np.flatnonzero(candidates & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
-    if epoch.clock == "common" and not belief.free[-2]:
-        return belief, used, np.zeros(0)
-    if not len(rows):
+    if not len(rows) or (epoch.clock == "common" and not belief.free[-2]):
         return belief, used, np.zeros(0)
     dt = epoch.time_s[rows] - belief.time_s
-    noise = row_noise(epoch, links, rows, dt)
+    covariance_r, rates = row_noise(epoch, links, rows, dt)
     miss, derivative = _misfit(belief.mean, epoch, links.rows(rows), rows, dt)
     spread = np.einsum("ij,jk,ik->i", derivative, belief.covariance, derivative)
     n = len(rows)
-    surprise = miss[:n] ** 2 / (spread[:n] + np.diag(noise[0]))
+    surprise = miss[:n] ** 2 / (spread[:n] + np.diag(covariance_r))
     near = surprise <= GATE_SIGMA**2
-    if noise[1] is not None:
-        near &= np.abs(miss[n:]) <= GATE_SIGMA * np.sqrt(spread[n:] + np.diag(noise[1]))
+    if rates is not None:
+        near &= np.abs(miss[n:]) <= GATE_SIGMA * np.sqrt(spread[n:] + np.diag(rates))
     if n > 2 and 2 * np.sum(near) < n:
         # most disagree: those that do not may do so by chance, and would drag the track along
         near[:] = False
@@ -59,13 +57,13 @@ def update(
     if not len(rows):
         return belief, used, surprise
     used[rows] = True
-    covariance_r, rates = row_noise(epoch, links, rows, dt)
     n = len(rows)
-    noise_all = covariance_r
+    noise_all = covariance_r[np.ix_(near, near)]
     if rates is not None:
+        ranges = noise_all
         noise_all = np.zeros((2 * n, 2 * n))
-        noise_all[:n, :n] = covariance_r
-        noise_all[n:, n:] = rates
+        noise_all[:n, :n] = ranges
+        noise_all[n:, n:] = rates[np.ix_(near, near)]
     mean = belief.mean
     chosen = links.rows(rows)
     gain = derivative = np.zeros((0, 0))
