@@ -277,7 +277,7 @@ class Receiver:
         flags: list[str] = []
         heard: list[Detection] = []
         for microphone in self._microphones:
-            channel, odd = screen(samples[:, microphone.channel])
+            channel, odd = screen(samples[:, microphone.channel], self._plan.sample_rate_hz)
             flags += [f"microphone {microphone.id}: {text}" for text in odd]
             windows = {
                 emitter: (window.opens_s + offset + microphone.delay_s, window.closes_s + offset + microphone.delay_s)

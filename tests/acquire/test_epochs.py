@@ -124,8 +124,8 @@ def test_reach_where_nothing_is_known() -> None:
 
 
 def test_sound_samples_are_left_alone(rng: np.random.Generator) -> None:
-    samples = (0.3 * rng.standard_normal(1000)).clip(-0.9, 0.9).astype(np.float32)
-    fit, flags = screen(samples)
+    samples = (0.2 * rng.standard_normal(5000)).astype(np.float32)
+    fit, flags = screen(samples, 48e3)
     assert flags == ()
     np.testing.assert_array_equal(fit, samples)
 
@@ -134,7 +134,7 @@ def test_sound_samples_are_left_alone(rng: np.random.Generator) -> None:
 def test_samples_that_are_not_finite_are_flagged_and_silenced(odd: float) -> None:
     samples = np.full(1000, 0.1, np.float32)
     samples[[3, 700]] = odd
-    fit, flags = screen(samples)
+    fit, flags = screen(samples, 48e3)
     assert len(flags) == 1
     assert flags[0].startswith("2 of 1000 samples are not finite")
     assert fit[3] == fit[700] == 0
@@ -146,11 +146,25 @@ def test_clipped_samples_are_flagged() -> None:
     samples = np.full(1000, 0.1, np.float32)
     samples[:20] = 1.0
     samples[20:25] = -1.0
-    fit, flags = screen(samples)
+    fit, flags = screen(samples, 48e3)
     assert flags == ("2.50 % of samples are clipped; lower the gain",)
     np.testing.assert_array_equal(fit, samples)
 
 
+def test_clipping_below_full_scale_is_told_by_its_level(rng: np.random.Generator) -> None:
+    samples = (0.3 * rng.standard_normal(20_000)).clip(-0.7, 0.7).astype(np.float32)
+    assert any("clipped" in flag for flag in screen(samples, 48e3)[1])
+
+
+def test_drop_outs_are_told(rng: np.random.Generator) -> None:
+    samples = (0.2 * rng.standard_normal(20_000)).astype(np.float32)
+    samples[5000:5480] = 0.0
+    assert screen(samples, 48e3)[1] == ("1 drop-outs, 10 ms in all, in which every sample is 0",)
+    samples[:480] = samples[-480:] = 0.0  # the recording's ends are no drop-outs
+    assert len(screen(samples, 48e3)[1]) == 1
+    assert screen(samples, 48e3)[1][0].startswith("1 drop-outs")
+
+
 def test_dead_channels_are_flagged() -> None:
-    assert screen(np.zeros(100, np.float32))[1] == ("no sound at all: every sample is 0",)
-    assert any("no sound at all" in flag for flag in screen(np.full(100, np.nan, np.float32))[1])
+    assert screen(np.zeros(100, np.float32), 48e3)[1] == ("no sound at all: every sample is 0",)
+    assert any("no sound at all" in flag for flag in screen(np.full(100, np.nan, np.float32), 48e3)[1])

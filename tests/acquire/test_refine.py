@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sonofix.acquire.baseband import band_limited, design_band
-from sonofix.acquire.refine import Burst, burst_columns, gram, refine
+from sonofix.acquire.kernels import add_model, assemble, columns
+from sonofix.acquire.refine import Burst, Joint, refine
 from sonofix.records import Floats
 from sonofix.signals import codes
 from sonofix.signals.interpolate import sample
@@ -38,7 +39,19 @@ def model(burst: Burst) -> NDArray[np.complex128]:
 
 
 def columns_of(burst: Burst) -> NDArray[np.complex128]:
-    return burst_columns(burst, START_S, RATE_HZ, COUNT)
+    return filled(burst)[0]
+
+
+def fixed(burst: Burst) -> tuple[object, ...]:
+    w = burst.waveform
+    return w.envelope, w.rate_hz, w.start_s, w.duration_s / 2, w.carrier_hz, START_S, RATE_HZ
+
+
+def filled(burst: Burst) -> tuple[NDArray[np.complex128], NDArray[np.float32], tuple[int, int]]:
+    """Columns (4, n) as complex numbers, as the kernel leaves them, and where they sound."""
+    parts = np.zeros((4, 2, COUNT), np.float32)
+    support = columns(*fixed(burst), burst.arrival_s, burst.beta, burst.kappa, parts)
+    return parts[:, 0].astype(np.complex128) + 1j * parts[:, 1], parts, support
 
 
 BURSTS = (
@@ -50,7 +63,11 @@ BURSTS = (
 
 @pytest.mark.parametrize("burst", BURSTS)
 def test_kernel_is_its_plain_twin(burst: Burst) -> None:
-    np.testing.assert_allclose(columns_of(burst)[0], model(replace(burst, gain=1.0)), atol=1e-12)
+    # single precision, and a sample or two of the filters' last ripples at either end
+    np.testing.assert_allclose(columns_of(burst)[0], model(replace(burst, gain=1.0)), atol=3e-7)
+    total = np.full(COUNT, 0.1 + 0j)
+    add_model(total, *fixed(burst), burst.arrival_s, burst.beta, burst.kappa, burst.gain)
+    np.testing.assert_allclose(total - 0.1, model(burst), atol=1e-7)
 
 
 @pytest.mark.parametrize("burst", BURSTS)
@@ -64,10 +81,45 @@ def test_derivatives_are_differences(burst: Burst, row: int, name: str, step: fl
     np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-3 * np.abs(slow).max())
 
 
-@pytest.mark.parametrize("length", [1, 511, 512, 3000])
-def test_gram_kernel_is_a_matrix_product(length: int, rng: np.random.Generator) -> None:
-    rows = rng.standard_normal((7, length))
-    np.testing.assert_allclose(gram(rows), rows @ rows.T, rtol=1e-10, atol=1e-10)
+def test_normal_matrix_is_that_of_plain_columns(rng: np.random.Generator) -> None:
+    """Also where a burst was moved, dropped, and samples were left out."""
+    joint = Joint(noisy(rng, 1.0), START_S, RATE_HZ, KAPPA_SD, 1.0, room=1)
+    for burst in (*BURSTS, BURSTS[1]):
+        joint.add(burst)
+    joint.keep([0, 1, 2])
+    aside = np.zeros(COUNT, bool)
+    aside[COUNT // 2 : COUNT // 2 + 50] = True
+    joint.leave_out(aside)
+    unit = [np.where(aside, 0, columns_of(burst)) for burst in BURSTS]
+    gain: NDArray[np.complex128] = np.array([2.0, 1j, 0.3 - 1j])
+    rows = np.concatenate([[v[0], 1j * v[0], *(g * v[1:])] for v, g in zip(unit, gain, strict=True)])
+    plain = (np.conj(rows) @ rows.T).real
+    size = np.sqrt(np.diag(plain))
+    np.testing.assert_allclose(joint._normal(gain, np.zeros(3))[0], plain / np.outer(size, size), atol=3e-6)
+    seen = np.conj(np.concatenate(unit)) @ joint.residual
+    norm = np.linalg.norm(np.concatenate(unit), axis=1) * np.linalg.norm(joint.residual)
+    np.testing.assert_allclose(joint._seen(0, 3).ravel() / norm, seen / norm, atol=3e-6)
+
+
+def test_assembly_is_a_product_of_real_rows(rng: np.random.Generator) -> None:
+    unit = rng.standard_normal((2, 4, 50)) + 1j * rng.standard_normal((2, 4, 50))
+    gain = np.array([0.3 - 2j, 1j])
+    rows = np.concatenate([[v[0], 1j * v[0], *(g * v[1:])] for v, g in zip(unit, gain, strict=True)])
+    flat = unit.reshape(8, 50)
+    np.testing.assert_allclose(assemble(np.conj(flat) @ flat.T, gain), (np.conj(rows) @ rows.T).real, atol=1e-12)
+
+
+def test_residual_is_what_bursts_leave(rng: np.random.Generator) -> None:
+    heard = noisy(rng, 1e-2) + model(BURSTS[0]) + model(BURSTS[1])
+    joint = Joint(heard, START_S, RATE_HZ, KAPPA_SD, 1.0)
+    for burst in BURSTS[:2]:
+        joint.add(burst)
+    joint.settle(10)
+    left = heard - model(joint.bursts[0]) - model(joint.bursts[1])
+    np.testing.assert_allclose(joint.residual, left, atol=1e-7)
+    np.testing.assert_allclose(joint.residual_with(1), left + model(joint.bursts[1]), atol=1e-7)
+    joint.replace_baseband(heard + 0.5)
+    np.testing.assert_allclose(joint.residual, left + 0.5, atol=1e-7)
 
 
 def test_nothing_sounds_outside_the_table() -> None:
@@ -108,7 +160,7 @@ def test_an_echo_of_the_same_code_is_told_apart(rng: np.random.Generator) -> Non
     found, _, _, _ = settled(model(direct) + model(echo), [off(direct, rng), off(echo, rng)])
     for burst, true in zip(found, (direct, echo), strict=True):
         assert burst.arrival_s == pytest.approx(true.arrival_s, abs=1e-8)
-        assert burst.beta == pytest.approx(true.beta, abs=1e-7)
+        assert burst.beta == pytest.approx(true.beta, abs=5e-7)
         assert abs(burst.gain - true.gain) < 1e-4
 
 
@@ -144,7 +196,7 @@ def test_covariance_is_the_inverse_of_fishers_information(count: int, rng: np.ra
     np.testing.assert_allclose(noise, 1e-4, rtol=5 / np.sqrt(sounding) + 5 * count / (2 * sounding))
     for i, covariance in enumerate(covariances):
         expected = fisher_covariance(found, float(noise[i]))[5 * i + 2 : 5 * i + 4, 5 * i + 2 : 5 * i + 4]
-        np.testing.assert_allclose(covariance, expected, rtol=2e-3, atol=2e-3 * np.sqrt(np.prod(np.diag(expected))))
+        np.testing.assert_allclose(covariance, expected, rtol=5e-3, atol=5e-3 * np.sqrt(np.prod(np.diag(expected))))
 
 
 def test_whiteness_scales_the_noise(rng: np.random.Generator) -> None:

@@ -19,8 +19,8 @@ from sonofix.signals.interpolate import read
 LOSS_DB = 1.0
 """Of correlation power at the edge of a velocity cell, at worst."""
 
-MOST_KEPT = 3
-"""Transform lengths whose spectra are kept: one for a cold search, one for a warm one, one to spare."""
+MOST_KEPT = 2
+"""Transform lengths whose spectra are kept: an epoch's, and that of one cut short or of a search for the clock."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +37,7 @@ class Bank:
     replicas : complex64 (m, n)
         Unit energy, sampled at the base band's rate; sample 0 stands ``lead_s`` before the burst's start.
     lead_s : float
+    sound_speed_mps : float
     energy : float
         Of the signature at unit gain, in base-band samples.
     kept : dict
@@ -48,10 +49,22 @@ class Bank:
     range_rate_mps: Floats
     replicas: NDArray[np.complex64]
     lead_s: float
+    sound_speed_mps: float
     energy: float
     kept: dict[int, NDArray[np.complex64]] = field(default_factory=dict, repr=False)
 
-    def spectra(self, length: int, rows: slice = slice(None)) -> NDArray[np.complex64]:
+    @property
+    def step(self) -> float:
+        """Between two range rates, m/s; 0 where there is but one."""
+        return float(self.range_rate_mps[1] - self.range_rate_mps[0]) if len(self.range_rate_mps) > 1 else 0.0
+
+    def length(self, delays: int) -> int:
+        """Transform length that holds so many delays of the replicas."""
+        import scipy.fft
+
+        return int(scipy.fft.next_fast_len(self.replicas.shape[1] + delays) or 0)
+
+    def spectra(self, length: int) -> NDArray[np.complex64]:
         """Conjugate spectra (m, length) of the replicas, ready to multiply with a spectrum of samples.
 
         Kept once computed: a plan searches a few lengths, over and over.
@@ -60,9 +73,9 @@ class Bank:
 
         if length not in self.kept:
             if len(self.kept) >= MOST_KEPT:
-                self.kept.clear()
+                self.kept.pop(next(iter(self.kept)))
             self.kept[length] = np.conj(np.asarray(scipy.fft.fft(self.replicas, length, axis=-1)))
-        return self.kept[length][rows]
+        return self.kept[length]
 
 
 def velocity_step_mps(waveform: Waveform, sound_speed_mps: float) -> float:
@@ -99,13 +112,19 @@ def stretched(
     out = np.zeros((betas.shape[0], count), np.complex64)
     for row in range(betas.shape[0]):
         energy = 0.0
+        turn = -2.0 * np.pi * carrier_hz * betas[row]
+        ahead = complex(np.cos(turn / rate_hz), np.sin(turn / rate_hz))
+        carrier = 1.0 + 0.0j
         for n in range(count):
             u = n / rate_hz - lead_s - half_s
+            if n % 256 == 0:
+                carrier = complex(np.cos(turn * u), np.sin(turn * u))
+            else:
+                carrier *= ahead
             position = (half_s + (1.0 - betas[row]) * u - table_start_s) * table_rate_hz
             if position < 1.0 or position > table.shape[0] - 3.0:
                 continue
-            phase = -2.0 * np.pi * carrier_hz * betas[row] * u
-            value = read(table, position) * complex(np.cos(phase), np.sin(phase))
+            value = read(table, position) * carrier
             out[row, n] = value
             energy += value.real**2 + value.imag**2
         for n in range(count):
@@ -137,4 +156,4 @@ def make_bank(emitter: str, waveform: Waveform, band: Band, max_rate_mps: float,
         count,
     )
     energy = float(np.sum(np.abs(waveform.signature) ** 2)) * band.rate_hz / waveform.rate_hz
-    return Bank(emitter, waveform, rates, replicas, lead_s, energy)
+    return Bank(emitter, waveform, rates, replicas, lead_s, sound_speed_mps, energy)

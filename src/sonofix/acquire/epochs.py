@@ -11,7 +11,13 @@ from sonofix.records import Floats
 from sonofix.site import Site
 
 CLIPPED = 0.9995
-"""Of full scale: at or above, a sample counts as clipped."""
+"""Of the loudest sample: at or above, a sample counts as clipped, if there are many."""
+
+LOUD = 0.25
+"""Of full scale: nothing clips below."""
+
+DROP_OUT_S = 1e-3
+"""Samples that stay exactly 0 for longer were never recorded."""
 
 START_GUARD_S = 5e-3
 """Bursts that begin this soon after an unsynchronised recording may hide a first path that came before it."""
@@ -111,16 +117,26 @@ class Schedule:
             self._first_s = heard + self._period_s
 
 
-def screen(samples: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Samples fit to be filtered, and what was wrong with them: not finite (set to 0), clipped, or silent."""
+def screen(samples: NDArray[np.float32], rate_hz: float) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Samples fit to be filtered, and what was wrong with them: not finite (set to 0), clipped, missing or silent."""
     flags = []
     finite = np.isfinite(samples)
     if not finite.all():
         flags.append(f"{np.sum(~finite)} of {samples.size} samples are not finite; taken as silence")
         samples = np.where(finite, samples, np.float32(0))
-    clipped = np.abs(samples) >= CLIPPED
-    if clipped.mean() > 1e-4:
-        flags.append(f"{100 * clipped.mean():.2f} % of samples are clipped; lower the gain")
-    if not samples.any():
+    size = np.abs(samples)
+    loudest = float(np.max(size, initial=0.0))
+    # a recorder may clip below full scale: then its loudest value comes again and again
+    clipped = float(np.mean(size >= CLIPPED * loudest)) if loudest > LOUD else 0.0
+    if clipped > 2e-4:
+        flags.append(f"{100 * clipped:.2f} % of samples are clipped; lower the gain")
+    if loudest == 0.0:
         flags.append("no sound at all: every sample is 0")
+    else:
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], samples == 0.0, [False]]))).reshape(-1, 2)
+        lengths = np.diff(edges, axis=1)[:, 0][(edges[:, 0] > 0) & (edges[:, 1] < samples.size)]
+        missing = lengths[lengths > DROP_OUT_S * rate_hz]
+        if len(missing):
+            lost_ms = 1e3 * float(np.sum(missing)) / rate_hz
+            flags.append(f"{len(missing)} drop-outs, {lost_ms:.0f} ms in all, in which every sample is 0")
     return samples, tuple(flags)

@@ -139,6 +139,7 @@ def acquire(
                 false_alarm_rate=plan.false_alarm_rate,
             )
             job.run(predictions or {})
+            notes += job.notes
             found += job.detections(receiver)
     found.sort(key=lambda detection: -detection.amplitude)
     return tuple(found), tuple(notes)

@@ -4,23 +4,35 @@ Heard about its middle t₀, a burst's own time is ``τ = T/2 + (t − t₀) −
 rate and κ the range acceleration over the sound speed. The carrier's phase follows the same τ, so that motion within
 the burst is seen by the carrier, and the arrival by the envelope alone (its phase at t₀ is free: the bound is that for
 unknown carrier phase).
+
+Bursts join one by one. The derivatives of a burst that has hardly moved are kept, and so are their inner products, so
+that another one among fifty costs little; what is left over is always that of the bursts as they are.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.acquire.kernels import add_model, assemble, columns
 from sonofix.records import Floats, Waveform
-from sonofix.signals.interpolate import read, read_slope
 
 Complexes = NDArray[np.complexfloating]
 
 STEP_LIMIT = np.array([1e-4, 3e-4, 1e-1])
 """Of one iteration in arrival (s), β and κ (1/s)."""
+
+STALE_RAD = 0.3
+FRESH_RAD = 0.03
+"""Derivatives are renewed when a burst's phase, at any frequency and moment that counts, has turned by this: while
+bursts are still being found, and when it is to be exact."""
+
+SETTLED_RAD = 1e-4
+"""A step that turns no phase by more changes nothing: 3 µm."""
+
+MOST_DAMPING = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,80 +45,250 @@ class Burst:
     kappa: float
     gain: complex
 
-
-@numba.njit(cache=True)
-def columns(
-    table: NDArray[np.complex128],
-    table_rate_hz: float,
-    table_start_s: float,
-    half_s: float,
-    carrier_hz: float,
-    start_s: float,
-    rate_hz: float,
-    count: int,
-    arrival_s: float,
-    beta: float,
-    kappa: float,
-) -> NDArray[np.complex128]:
-    """Model of one burst of unit gain and its derivatives by arrival, β and κ: (4, count), 0 where it is silent."""
-    out = np.zeros((4, count), np.complex128)
-    turn = -2j * np.pi * carrier_hz
-    for n in range(count):
-        u = start_s + n / rate_hz - arrival_s
-        tau = half_s + u - beta * u - 0.5 * kappa * u * u
-        position = (tau - table_start_s) * table_rate_hz
-        if position < 1.0 or position > table.shape[0] - 3.0:
-            continue
-        phase = -2.0 * np.pi * carrier_hz * (beta * u + 0.5 * kappa * u * u)
-        carrier = complex(np.cos(phase), np.sin(phase))
-        model = read(table, position) * carrier
-        slope = read_slope(table, position) * table_rate_hz * carrier
-        out[0, n] = model
-        # u falls as the arrival grows
-        out[1, n] = -(1.0 - beta - kappa * u) * slope - turn * (beta + kappa * u) * model
-        out[2, n] = u * (turn * model - slope)
-        out[3, n] = 0.5 * u * u * (turn * model - slope)
-    return out
+    @property
+    def state(self) -> Floats:
+        """Arrival, β and κ."""
+        return np.array([self.arrival_s, self.beta, self.kappa])
 
 
-@numba.njit(cache=True, fastmath=True)
-def gram(rows: Floats) -> Floats:
-    """``rows @ rows.T`` in blocks that stay in the cache.
+class Joint:
+    """Bursts fitted together to one stretch of base band.
 
-    A threaded matrix product of this size spends its time waiting for threads as soon as the machine does other work.
+    Parameters
+    ----------
+    baseband : complex128 (n,)
+        First sample at ``start_s``.
+    kappa_sd : float
+        Prior deviation of each κ, 1/s: what acceleration across the line of sight is plausible, over c.
+    whiteness : float
+        `Band.whiteness`: noise inside the pass band is denser than the same power spread over the whole base band.
+
+    Attributes
+    ----------
+    bursts : list of Burst
+    residual : complex128 (n,)
+        What they leave.
     """
-    count, length = rows.shape
-    out = np.zeros((count, count))
-    for begin in range(0, length, 512):
-        end = min(begin + 512, length)
-        for i in range(count):
-            for j in range(i + 1):
-                total = 0.0
-                for k in range(begin, end):
-                    total += rows[i, k] * rows[j, k]
-                out[i, j] += total
-    for i in range(count):
-        for j in range(i):
-            out[j, i] = out[i, j]
-    return out
+
+    def __init__(
+        self, baseband: Complexes, start_s: float, rate_hz: float, kappa_sd: float, whiteness: float, room: int = 8
+    ) -> None:
+        self.bursts: list[Burst] = []
+        self.residual: NDArray[np.complex128] = np.array(baseband, np.complex128)
+        self._baseband = baseband
+        self._left_out = np.zeros(len(baseband), bool)
+        self._start_s, self._rate_hz = start_s, rate_hz
+        self._kappa_sd, self._whiteness = kappa_sd, whiteness
+        count = len(baseband)
+        # real and imaginary part of the model and its derivatives by arrival, β and κ, for each burst
+        self._columns = np.zeros((room, 4, 2, count), np.float32)
+        self._products = np.zeros((4 * room, 4 * room), np.complex128)
+        self._support = np.zeros((room, 2), np.int64)
+        self._made = np.zeros((room, 3))  # arrival, β and κ that the columns are of
+        self._turn = np.zeros((room, 3))  # phase that a unit of each turns
+
+    def add(self, burst: Burst) -> None:
+        """Take in another burst; its gain is solved for in what the others leave."""
+        i = len(self.bursts)
+        if i == len(self._support):
+            self._grow()
+        half_s = burst.waveform.duration_s / 2
+        turn = 2 * np.pi * burst.waveform.carrier_hz
+        self._turn[i] = 2 * np.pi * rms_hz(burst.waveform), turn * half_s, turn * half_s**2 / 2
+        self.bursts.append(burst)
+        self._renew(i)
+        energy = self._products[4 * i, 4 * i].real
+        seen = self._seen(i, i + 1)[0, 0]
+        gain = complex(seen / energy) if energy > 0 else 0j
+        self.bursts[i] = replace(burst, gain=gain)
+        self._subtract(self.residual, self.bursts[i])
+        self.residual[self._left_out] = 0.0
+
+    def keep(self, which: list[int]) -> None:
+        """Drop all bursts but these; `settle` what is left."""
+        rows = (4 * np.array(which, int)[:, None] + np.arange(4)).ravel()
+        count = len(which)
+        self._products[: 4 * count, : 4 * count] = self._products[np.ix_(rows, rows)]
+        for table in (self._columns, self._support, self._made, self._turn):
+            table[:count] = table[which]
+        self.bursts = [self.bursts[i] for i in which]
+        self.residual = self._left(self.bursts)
+
+    def replace_baseband(self, baseband: Complexes) -> None:
+        """Fit the same bursts to other samples of the same stretch (a tone was followed anew)."""
+        self._baseband = baseband
+        self.residual = self._left(self.bursts)
+
+    def leave_out(self, which: NDArray[np.bool_]) -> None:
+        """Fit without some samples (n,): what happens in them tells nothing of bursts."""
+        self._left_out = which
+        self.residual = self._left(self.bursts)
+        for i in range(len(self.bursts)):
+            self._renew(i)
+
+    def settle(self, iterations: int, stale_rad: float = STALE_RAD) -> None:
+        """Gauss–Newton on all bursts at once, Levenberg-damped where a step does not lower the misfit."""
+        if not self.bursts:
+            return
+        state = np.stack([b.state for b in self.bursts])
+        gain = np.array([b.gain for b in self.bursts])
+        damping = 0.0
+        for _ in range(iterations):
+            # κ² counts beside |residual|² by the noise, which is known the better the further this has come
+            weight = self.noise() / (2 * self._kappa_sd**2)
+            cost = _power(self.residual) + float(np.sum(weight * state[:, 2] ** 2))
+            self._renew_stale(stale_rad)
+            normal, size = self._normal(gain, weight)
+            seen = self._seen(0, len(self.bursts))
+            right = self._right(seen, gain)
+            right[4::5] -= weight * state[:, 2]
+            normal[np.diag_indices(len(normal))] += damping
+            step = (np.linalg.solve(normal, right / size) / size).reshape(-1, 5)
+            # half a chip and a tenth of a metre a second bound what the linearisation can be trusted for
+            move = np.clip(step[:, 2:], -STEP_LIMIT, STEP_LIMIT)
+            moved = [
+                Burst(b.waveform, *row, complex(g))
+                for b, row, g in zip(
+                    self.bursts, (state + move).tolist(), gain + step[:, 0] + 1j * step[:, 1], strict=True
+                )
+            ]
+            residual = self._left(moved)
+            tried = _power(residual) + float(np.sum(weight * (state[:, 2] + move[:, 2]) ** 2))
+            if tried > cost * (1 + 1e-12):
+                damping = max(4 * damping, 0.05)
+                if damping > MOST_DAMPING:
+                    break
+                continue
+            self.bursts, self.residual = moved, residual
+            state, gain = state + move, np.array([b.gain for b in moved])
+            settled = cost - tried < 1e-9 * cost or np.max(np.abs(move) * self._turn[: len(moved)]) < SETTLED_RAD
+            damping /= 4
+            if settled:
+                break
+
+    def residual_with(self, i: int) -> NDArray[np.complex128]:
+        """What all bursts but one leave (n,)."""
+        out = self.residual.copy()
+        self._subtract(out, replace(self.bursts[i], gain=-self.bursts[i].gain))
+        out[self._left_out] = 0.0
+        return out
+
+    def noise(self) -> Floats:
+        """White-equivalent power left per sample around each burst (k,)."""
+        total = np.concatenate([[0.0], np.cumsum(self.residual.real**2 + self.residual.imag**2)])
+        first, last = self._support[: len(self.bursts)].T
+        power = self._whiteness * (total[last] - total[first]) / np.maximum(last - first, 1)
+        # what went into the fit, five real numbers a burst, is missing from what is left
+        span = int(np.max(last, initial=1) - np.min(first, initial=0))
+        share = np.maximum(1.0 - 2.5 * len(self.bursts) / max(span, 1), 0.1)
+        return np.maximum(power / share, 1e-24)
+
+    def covariances(self, noise: Floats) -> list[Floats]:
+        """Of (arrival_s, β) of each burst, marginal over all else: (2, 2) each."""
+        if not self.bursts:
+            return []
+        self._renew_stale(FRESH_RAD)
+        gain = np.array([b.gain for b in self.bursts])
+        normal, size = self._normal(gain, noise / (2 * self._kappa_sd**2))
+        spread = np.linalg.solve(normal, np.eye(len(normal))) / np.outer(size, size)
+        return [noise[i] / 2 * spread[5 * i + 2 : 5 * i + 4, 5 * i + 2 : 5 * i + 4] for i in range(len(self.bursts))]
+
+    def _normal(self, gain: Complexes, weight: Floats) -> tuple[Floats, Floats]:
+        """Normal matrix (5 k, 5 k) of gain (two parts), arrival, β and κ, scaled to a unit diagonal, and its scale."""
+        normal = assemble(self._products, gain)
+        kappa = np.arange(4, len(normal), 5)
+        normal[kappa, kappa] += weight
+        size = np.sqrt(np.diag(normal))
+        size[size == 0] = 1.0
+        normal /= np.outer(size, size)
+        normal[np.diag_indices(len(normal))] += 1e-9
+        return normal, size
+
+    def _seen(self, first: int, last: int) -> Complexes:
+        """Inner products (last − first, 4) of some bursts' columns with what is left."""
+        count = len(self.residual)
+        parts = np.ascontiguousarray(self.residual, np.complex128).view(np.float64).reshape(count, 2)
+        seen = self._columns[first:last].reshape(-1, count) @ parts.astype(np.float32)
+        return _inner(seen.reshape(last - first, 4, 2, 2))
+
+    def _right(self, seen: Complexes, gain: Complexes) -> Floats:
+        right = np.empty((len(gain), 5))
+        right[:, 0], right[:, 1] = seen[:, 0].real, seen[:, 0].imag
+        right[:, 2:] = (np.conj(gain)[:, None] * seen[:, 1:]).real
+        return right.ravel()
+
+    def _left(self, bursts: list[Burst]) -> NDArray[np.complex128]:
+        out = np.array(self._baseband, np.complex128)
+        for burst in bursts:
+            self._subtract(out, burst)
+        out[self._left_out] = 0.0
+        return out
+
+    def _subtract(self, residual: Complexes, burst: Burst) -> None:
+        w = burst.waveform
+        add_model(
+            residual,
+            w.envelope,
+            w.rate_hz,
+            w.start_s,
+            w.duration_s / 2,
+            w.carrier_hz,
+            self._start_s,
+            self._rate_hz,
+            burst.arrival_s,
+            burst.beta,
+            burst.kappa,
+            -burst.gain,
+        )
+
+    def _renew_stale(self, stale_rad: float) -> None:
+        state = np.stack([b.state for b in self.bursts])
+        moved = np.max(np.abs(state - self._made[: len(state)]) * self._turn[: len(state)], axis=1)
+        for i in np.flatnonzero(moved > stale_rad):
+            self._renew(int(i))
+
+    def _renew(self, i: int) -> None:
+        """Columns of burst i, and their products with all others'."""
+        burst = self.bursts[i]
+        w = burst.waveform
+        self._support[i] = columns(
+            w.envelope,
+            w.rate_hz,
+            w.start_s,
+            w.duration_s / 2,
+            w.carrier_hz,
+            self._start_s,
+            self._rate_hz,
+            burst.arrival_s,
+            burst.beta,
+            burst.kappa,
+            self._columns[i],
+        )
+        self._columns[i][..., self._left_out] = 0.0
+        self._made[i] = burst.state
+        first, last = self._support[i]
+        bursts, count = len(self.bursts), len(self.residual)
+        others = self._columns[:bursts].reshape(-1, count)[:, first:last]
+        mixed = others @ self._columns[i].reshape(8, count)[:, first:last].T
+        block = _inner(mixed.reshape(bursts, 4, 2, 4, 2).transpose(0, 1, 3, 2, 4)).reshape(4 * bursts, 4)
+        self._products[: 4 * bursts, 4 * i : 4 * i + 4] = block
+        self._products[4 * i : 4 * i + 4, : 4 * bursts] = np.conj(block.T)
+
+    def _grow(self) -> None:
+        room = len(self._support)
+        for name in ("_columns", "_support", "_made", "_turn"):
+            table = getattr(self, name)
+            setattr(self, name, np.concatenate([table, np.zeros_like(table)]))
+        wider = np.zeros((8 * room, 8 * room), np.complex128)
+        wider[: 4 * room, : 4 * room] = self._products
+        self._products = wider
 
 
-def burst_columns(burst: Burst, start_s: float, rate_hz: float, count: int) -> NDArray[np.complex128]:
-    """`columns` of a burst."""
-    w = burst.waveform
-    return columns(
-        w.envelope,
-        w.rate_hz,
-        w.start_s,
-        w.duration_s / 2,
-        w.carrier_hz,
-        start_s,
-        rate_hz,
-        count,
-        burst.arrival_s,
-        burst.beta,
-        burst.kappa,
-    )
+def rms_hz(waveform: Waveform) -> float:
+    """Root mean square offset from the carrier of a burst's envelope."""
+    slope = np.diff(waveform.envelope) * waveform.rate_hz
+    power = float(np.sum(np.abs(waveform.envelope) ** 2))
+    return float(np.sqrt(np.sum(np.abs(slope) ** 2) / max(power, 1e-300)) / (2 * np.pi))
 
 
 def refine(
@@ -118,17 +300,14 @@ def refine(
     whiteness: float,
     iterations: int = 12,
 ) -> tuple[list[Burst], list[Floats], Complexes, Floats]:
-    """Gauss–Newton on all bursts at once, Levenberg-damped where a step does not lower the misfit.
+    """Fit bursts to a stretch of base band, all at once, from the starting values given.
 
     Parameters
     ----------
-    baseband : complex128 (n,)
+    baseband, start_s, rate_hz, kappa_sd, whiteness
+        As for `Joint`.
     bursts : list of Burst
         Starting values; gains are solved for.
-    kappa_sd : float
-        Prior deviation of each κ, 1/s: what acceleration across the line of sight is plausible, over c.
-    whiteness : float
-        `Band.whiteness`: noise inside the pass band is denser than the same power spread over the whole base band.
 
     Returns
     -------
@@ -139,96 +318,18 @@ def refine(
     noise : float64 (len(bursts),)
         White-equivalent noise power per sample around each burst.
     """
-    count, n_bursts = len(baseband), len(bursts)
-    state = np.array([[b.arrival_s, b.beta, b.kappa] for b in bursts])
-    kappa_rows = 5 * np.arange(n_bursts) + 4
-
-    def evaluate(state: Floats) -> tuple[Complexes, Complexes, Complexes]:
-        """Model columns (n, 4, count), best gains (n,) and what they leave (count,)."""
-        parts = np.stack(
-            [
-                burst_columns(_moved(burst, row, 0j), start_s, rate_hz, count)
-                for burst, row in zip(bursts, state, strict=True)
-            ]
-        )
-        basis = parts[:, 0]
-        normal = np.einsum("in,jn->ij", np.conj(basis), basis)
-        normal[np.diag_indices(n_bursts)] += 1e-9 * np.trace(normal).real / n_bursts + 1e-300
-        gain = np.linalg.solve(normal, np.einsum("in,n->i", np.conj(basis), baseband))
-        return parts, gain, baseband - np.einsum("i,in->n", gain, basis)
-
-    parts, gain, residual = evaluate(state)
-    noise = _noise(residual, parts[:, 0], whiteness)
-    weight = noise / (2 * kappa_sd**2)  # of κ² beside |residual|²
-
-    def misfit(residual: Complexes, state: Floats) -> float:
-        return float(np.sum(np.abs(residual) ** 2) + np.sum(weight * state[:, 2] ** 2))
-
-    cost = misfit(residual, state)
-    damping = 0.0
-    for _ in range(iterations):
-        jacobian = _jacobian(parts, gain)
-        normal = np.asarray(gram(jacobian))
-        right = np.einsum("in,n->i", jacobian, _plain(residual))
-        normal[kappa_rows, kappa_rows] += weight
-        right[kappa_rows] -= weight * state[:, 2]
-        size = np.sqrt(np.diag(normal))
-        size[size == 0] = 1.0
-        scaled = normal / np.outer(size, size)
-        scaled[np.diag_indices(len(scaled))] += damping + 1e-12
-        step = (np.linalg.solve(scaled, right / size) / size).reshape(n_bursts, 5)[:, 2:]
-        # half a chip and a tenth of a metre a second bound what the linearisation can be trusted for
-        step = np.clip(step, -STEP_LIMIT, STEP_LIMIT)
-        tried = evaluate(state + step)
-        cost_tried = misfit(tried[2], state + step)
-        if cost_tried > cost * (1 + 1e-12):
-            damping = max(4 * damping, 0.05)
-            if damping > 1e3:
-                break
-            continue
-        state = state + step
-        parts, gain, residual = tried
-        settled = cost - cost_tried < 1e-7 * cost or np.max(np.abs(step[:, 0])) < 1e-9
-        cost = cost_tried
-        damping /= 4
-        if settled:
-            break
-    noise = _noise(residual, parts[:, 0], whiteness)
-    jacobian = _jacobian(parts, gain)
-    normal = np.asarray(gram(jacobian))
-    normal[kappa_rows, kappa_rows] += noise / (2 * kappa_sd**2)
-    size = np.sqrt(np.diag(normal))
-    size[size == 0] = 1.0
-    scaled = normal / np.outer(size, size)
-    scaled[np.diag_indices(len(scaled))] += 1e-12
-    spread = np.linalg.solve(scaled, np.eye(len(scaled))) / np.outer(size, size)
-    covariances = [noise[i] / 2 * spread[5 * i + 2 : 5 * i + 4, 5 * i + 2 : 5 * i + 4] for i in range(n_bursts)]
-    refined = [_moved(burst, row, complex(g)) for burst, row, g in zip(bursts, state, gain, strict=True)]
-    return refined, covariances, residual, noise
+    joint = Joint(baseband, start_s, rate_hz, kappa_sd, whiteness, max(1, len(bursts)))
+    for burst in bursts:
+        joint.add(burst)
+    joint.settle(iterations, FRESH_RAD)
+    noise = joint.noise()
+    return joint.bursts, joint.covariances(noise), joint.residual, noise
 
 
-def _moved(burst: Burst, row: Floats, gain: complex) -> Burst:
-    """Return a burst at another arrival, β and κ, of another gain."""
-    return Burst(burst.waveform, float(row[0]), float(row[1]), float(row[2]), gain)
+def _inner(parts: NDArray[np.float32]) -> Complexes:
+    """Σ conj(a) b from the products (…, 2, 2) of a's real and imaginary part with b's."""
+    return (parts[..., 0, 0] + parts[..., 1, 1]) + 1j * (parts[..., 0, 1] - parts[..., 1, 0])
 
 
-def _plain(values: Complexes) -> Floats:
-    """Complex values as real and imaginary parts in turn: Re(aᴴ b) becomes a plain product."""
-    return np.ascontiguousarray(values).view(np.float64)
-
-
-def _jacobian(parts: Complexes, gain: Complexes) -> Floats:
-    """Rows: for each burst real gain, imaginary gain, arrival, β, κ; columns as `_plain`."""
-    n_bursts, _, count = parts.shape
-    jacobian = np.empty((n_bursts, 5, count), np.complex128)
-    jacobian[:, 0] = parts[:, 0]
-    jacobian[:, 1] = 1j * parts[:, 0]
-    jacobian[:, 2:] = parts[:, 1:] * gain[:, None, None]
-    return _plain(jacobian.reshape(5 * n_bursts, count))
-
-
-def _noise(residual: Complexes, models: Complexes, whiteness: float) -> Floats:
-    """White-equivalent residual power per sample where each burst sounds."""
-    sounding = models != 0
-    heard = np.maximum(np.sum(sounding, axis=1), 1)
-    return np.maximum(whiteness * (sounding @ np.abs(residual) ** 2) / heard, 1e-24)
+def _power(values: Complexes) -> float:
+    return float(np.vdot(values, values).real)

@@ -1,17 +1,35 @@
-"""Delay × velocity search by FFT, and detection at a stated false-alarm rate."""
+"""Delay × velocity search, and detection at a stated false-alarm rate.
+
+Cold: the whole plane, by FFT over delays, a row a velocity. Warm: a small part of it round a prediction, by sums over
+short blocks of a burst, which all velocities share.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank
 from sonofix.acquire.baseband import Band
+from sonofix.records import Floats
 
-SHORT_SEARCH = 256
-"""Delays that a warm search spans at most, mostly."""
+ROWS_AT_ONCE = 16
+"""Velocities transformed in one go: what stays in the cache."""
+
+BLOCK_TURN_RAD = 0.6
+"""Phase that the fastest velocity of a warm search turns within one block, against its centre."""
+
+CENTRE_SLIP = 0.25
+"""Of the shortest time a burst resolves: how far its ends may slip against the replica of a warm search."""
+
+EVERY = 7
+"""One delay in so many tells the noise of a cold search."""
+
+REMAINDER = 0.4
+"""Of the shortest time a burst resolves: this close to a known path nothing else can be told from it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,14 +37,15 @@ class Peak:
     """The highest cell of one emitter's search.
 
     ``start_s`` is when the burst's first chip is heard, recorder's clock; ``power`` the correlation power against the
-    unit-energy replica; ``noise`` that of noise in the same search (mean, from its median); ``threshold`` what
-    ``power / noise`` must exceed once nothing else disturbs. Peaks above ``worth_trying``, which noise alone reaches in
-    one search of three, are tried: in echoes a true burst may not stand out until others are taken away.
+    unit-energy replica; ``second`` the highest one elsewhere in the search; ``noise`` the mean that noise has there;
+    ``threshold`` what ``power / noise`` must exceed once nothing else disturbs. Peaks above ``worth_trying``, which
+    noise alone reaches in one search of three, are tried: a true burst may not stand out until others are taken away.
     """
 
     start_s: float
     range_rate_mps: float
     power: float
+    second: float
     noise: float
     threshold: float
     worth_trying: float
@@ -39,11 +58,10 @@ def search(
     band: Band,
     opens_s: float,
     closes_s: float,
-    rates: tuple[float, float] | None,
     known_s: list[float],
     false_alarm_rate: float,
 ) -> Peak | None:
-    """Find the highest correlation of one emitter's burst starting within [opens_s, closes_s].
+    """Find the highest correlation of one emitter's burst starting within [opens_s, closes_s], at any velocity.
 
     The search of the first seed, eqs 4–6, with its window stretched and its mean removed.
 
@@ -51,8 +69,6 @@ def search(
     ----------
     baseband : complex128 (n,)
         First sample at ``start_s``.
-    rates : (low, high) in m/s or None
-        Only range rates within; None: the whole bank.
     known_s : list of float
         Starts of paths already found; what stands within a correlation peak of them is their remainder.
     false_alarm_rate : float
@@ -64,38 +80,161 @@ def search(
     Peak or None
         None where no sample of the interval lies within the base band.
     """
+    first, count = _delays(baseband, start_s, bank, band, opens_s, closes_s)
+    if count < 2:
+        return None
+    best, row, some = profile(baseband[first : first + count - 1 + bank.replicas.shape[1]], bank, count)
+    noise = float(np.median(some)) / np.log(2.0)
+    cells = count * len(bank.replicas)
+    return _peak(best, row, start_s, first, bank, band, known_s, noise, cells, false_alarm_rate)
+
+
+def profile(
+    stretch: NDArray[np.complexfloating], bank: Bank, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+    """Highest correlation power over all velocities at each of ``count`` delays, its row, and a sample of all cells."""
     import scipy.fft
 
+    length = bank.length(count)
+    spectrum = np.asarray(scipy.fft.fft(stretch.astype(np.complex64), length))
+    spectra = bank.spectra(length)
+    best = np.full(count, -1.0, np.float32)
+    row = np.zeros(count, np.int64)
+    some = np.empty((len(spectra), (count - 1) // EVERY + 1), np.float32)
+    for low in range(0, len(spectra), ROWS_AT_ONCE):
+        product = spectra[low : low + ROWS_AT_ONCE] * spectrum
+        surface = np.asarray(scipy.fft.ifft(product, axis=-1, overwrite_x=True))
+        _highest(surface, low, best, row, some)
+    return best, row, some
+
+
+def search_near(
+    baseband: NDArray[np.complexfloating],
+    start_s: float,
+    bank: Bank,
+    band: Band,
+    opens_s: float,
+    closes_s: float,
+    rates: tuple[float, float],
+    known_s: list[float],
+    false_alarm_rate: float,
+) -> Peak | None:
+    """As `search`, for few delays and the range rates ``rates`` (low, high), m/s; noise is the power of all heard."""
+    first, count = _delays(baseband, start_s, bank, band, opens_s, closes_s)
+    if count < 1:
+        return None
+    low = max(0, int(np.searchsorted(bank.range_rate_mps, rates[0])) - 1)
+    high = max(low + 1, int(np.searchsorted(bank.range_rate_mps, rates[1])) + 1)
+    betas = bank.range_rate_mps[low:high] / bank.sound_speed_mps
+    half_s, turn = bank.waveform.duration_s / 2, 2 * np.pi * bank.waveform.carrier_hz
+    stretch = baseband[first : first + count - 1 + bank.replicas.shape[1]]
+    best = np.full(count, -1.0, np.float32)
+    row = np.zeros(count, np.int64)
+    # replicas far enough apart in velocity that none in between slips by more than a fraction of a chip
+    slip = bank.step / bank.sound_speed_mps * half_s * band.half_width_hz
+    per_centre = max(1, int(2 * CENTRE_SLIP / max(slip, 1e-9)))
+    for begin in range(0, len(betas), per_centre):
+        group = betas[begin : begin + per_centre]
+        centre = begin + len(group) // 2
+        offset = group - betas[centre]
+        widest = turn * float(np.max(np.abs(offset), initial=1e-9))
+        size = max(8, int(BLOCK_TURN_RAD / widest * band.rate_hz))
+        blocks = -(-bank.replicas.shape[1] // size)
+        middle_s = (np.arange(blocks) + 0.5) * size / band.rate_hz - bank.lead_s - half_s
+        twiddles = np.exp(1j * turn * np.outer(offset, middle_s))
+        near(stretch, bank.replicas[low + centre], size, twiddles, low + begin, best, row)
+    heard = stretch[stretch != 0]
+    noise = band.whiteness * float(np.vdot(heard, heard).real) / max(len(heard), 1)
+    return _peak(best, row, start_s, first, bank, band, known_s, noise, count * len(betas), false_alarm_rate)
+
+
+def _delays(
+    baseband: NDArray[np.complexfloating], start_s: float, bank: Bank, band: Band, opens_s: float, closes_s: float
+) -> tuple[int, int]:
+    """First sample at which a replica may begin, and how many there are."""
     first = max(0, int(np.floor((opens_s - bank.lead_s - start_s) * band.rate_hz)))
     last = min(len(baseband) - 1, int(np.ceil((closes_s - bank.lead_s - start_s) * band.rate_hz)))
-    if last <= first:
-        return None
-    rows = slice(None)
-    if rates is not None:
-        low = max(0, int(np.searchsorted(bank.range_rate_mps, rates[0])) - 1)
-        high = int(np.searchsorted(bank.range_rate_mps, rates[1])) + 1
-        rows = slice(low, max(high, low + 1))
-    count = last - first + 1
-    stretch = baseband[first : last + bank.replicas.shape[1]].astype(np.complex64)
-    # short searches share one length, so that their spectra are computed once
-    length = int(scipy.fft.next_fast_len(bank.replicas.shape[1] + max(count, SHORT_SEARCH)) or 0)
-    spectrum = np.asarray(scipy.fft.fft(stretch, length))
-    surface: NDArray[np.complex64] = np.asarray(
-        scipy.fft.ifft(spectrum * bank.spectra(length, rows), axis=-1, overwrite_x=True)
-    )[:, :count]
-    power = surface.real**2 + surface.imag**2
-    noise = float(np.median(power)) / np.log(2.0)
+    return first, last - first + 1
+
+
+def _peak(
+    best: NDArray[np.float32],
+    row: NDArray[np.int64],
+    start_s: float,
+    first: int,
+    bank: Bank,
+    band: Band,
+    known_s: list[float],
+    noise: float,
+    cells: int,
+    false_alarm_rate: float,
+) -> Peak:
     half = int(np.ceil(band.rate_hz / band.half_width_hz))
+    close = int(np.ceil(REMAINDER * band.rate_hz / band.half_width_hz))
     for known in known_s:
         at = round((known - bank.lead_s - start_s) * band.rate_hz) - first
-        power[:, max(0, at - half) : max(0, at + half + 1)] = 0.0
-    row, column = np.unravel_index(int(np.argmax(power)), power.shape)
-    threshold = float(np.log(power.size / false_alarm_rate))
+        best[max(0, at - close) : max(0, at + close + 1)] = 0.0
+    column = int(np.argmax(best))
+    elsewhere = np.concatenate([best[: max(0, column - half)], best[column + half + 1 :]])
     return Peak(
         start_s=start_s + (first + column) / band.rate_hz + bank.lead_s,
-        range_rate_mps=float(bank.range_rate_mps[rows][row]),
-        power=float(power[row, column]),
+        range_rate_mps=float(bank.range_rate_mps[row[column]]),
+        power=float(best[column]),
+        second=float(np.max(elsewhere, initial=0.0)),
         noise=max(noise, 1e-30),
-        threshold=threshold,
-        worth_trying=float(np.log(power.size)) + 1.0,
+        threshold=float(np.log(cells / false_alarm_rate)),
+        worth_trying=float(np.log(cells)) + 1.0,
     )
+
+
+@numba.njit(cache=True)
+def _highest(
+    surface: NDArray[np.complex64],
+    low: int,
+    best: NDArray[np.float32],
+    row: NDArray[np.int64],
+    some: NDArray[np.float32],
+) -> None:
+    """Keep the highest power of each delay and its row, and every so many cells."""
+    for i in range(surface.shape[0]):
+        for n in range(best.shape[0]):
+            power = surface[i, n].real ** 2 + surface[i, n].imag ** 2
+            if power > best[n]:
+                best[n] = power
+                row[n] = low + i
+        for k in range(some.shape[1]):
+            value = surface[i, k * EVERY]
+            some[low + i, k] = value.real**2 + value.imag**2
+
+
+@numba.njit(cache=True, fastmath=True)
+def near(
+    stretch: NDArray[np.complex128],
+    replica: NDArray[np.complex64],
+    size: int,
+    twiddles: NDArray[np.complex128],
+    low: int,
+    best: Floats,
+    row: NDArray[np.int64],
+) -> None:
+    """Correlation powers at the delays of ``best`` and the velocities of ``twiddles`` (m, blocks); keep the highest."""
+    blocks = twiddles.shape[1]
+    sums = np.empty(blocks, np.complex128)
+    real, imag = stretch.real.astype(np.float32), stretch.imag.astype(np.float32)
+    re, im = replica.real.copy(), replica.imag.copy()
+    for delay in range(best.shape[0]):
+        for block in range(blocks):
+            same = np.float32(0.0)
+            cross = np.float32(0.0)
+            for n in range(block * size, min((block + 1) * size, re.shape[0], real.shape[0] - delay)):
+                same += re[n] * real[delay + n] + im[n] * imag[delay + n]
+                cross += re[n] * imag[delay + n] - im[n] * real[delay + n]
+            sums[block] = complex(same, cross)
+        for m in range(twiddles.shape[0]):
+            total = 0.0 + 0.0j
+            for block in range(blocks):
+                total += twiddles[m, block] * sums[block]
+            power = total.real**2 + total.imag**2
+            if power > best[delay]:
+                best[delay] = power
+                row[delay] = low + m

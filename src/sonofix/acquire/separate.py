@@ -1,31 +1,36 @@
-"""One epoch of one microphone taken apart, loudest first.
+"""One epoch of one microphone taken apart: which bursts, by which paths, make up what was heard.
 
-Search all beacons in what is left, accept those near the strongest, refine what was found, subtract, and search again
-until nothing more stands above its threshold. So a beacon at 1 m does not hide one at 15 m, and echoes, which are
-paths of the same burst, do not hide beacons that are only heard once they are gone.
+Bursts that stand out of their own search are taken at once, refined together and subtracted, and what is left is
+searched for the rest: so a beacon at 1 m does not hide one at 15 m. Where more power remains than the quiet margins
+have, there are echoes, which are paths of the same bursts: then the loudest of all candidates is taken, one at a time,
+since in a crowd only the loudest is what it looks like.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank
 from sonofix.acquire.baseband import Band
-from sonofix.acquire.refine import Burst, refine
-from sonofix.acquire.search import Peak, search
+from sonofix.acquire.refine import FRESH_RAD, STALE_RAD, Burst, Joint
+from sonofix.acquire.search import Peak, search, search_near
 from sonofix.acquire.tones import MARGIN_S, Tone, refit
 from sonofix.records import Detection, Floats, Path, Prediction
 
-NEAR_STRONGEST = 10 ** (-6 / 10)
-"""Accepted in one pass: correlation power within this of the strongest. m-sequences isolate 9 dB at worst, so nothing
-this close can be another beacon's cross-talk."""
+STANDS_OUT = 10 ** (3 / 10)
+"""Over the second highest of its own search: cross-talk and echoes make many peaks alike."""
+
+NEAR_STRONGEST = 10 ** (-12 / 10)
+"""Accepted beside the strongest, unless it stands out by ``ALONE``: codes may resemble each other at one lag."""
+
+ALONE = 10 ** (6 / 10)
 
 PATH_POWER = 10 ** (-12 / 10)
-"""Echoes below this share of a burst's strongest path are left alone, and so is what comes before it."""
+"""A path before a burst's strongest one is its direct path where it has more than this share of its power."""
 
 UNEXPLAINED = 1.3
 """Power left while bursts sound, over that of their quiet margins, at which there must be more to find."""
@@ -33,49 +38,37 @@ UNEXPLAINED = 1.3
 RESIDUE = 10 ** (-12 / 10)
 """What a poorly matched burst leaves behind is weaker than this share of it."""
 
-MOST_PATHS = 8
+ECHO_POWER = 10 ** (-26 / 10)
+"""Weaker echoes than this share of a burst's strongest path are not looked for."""
+
+IMPULSE = 10.0
+"""Power over the median of what is left, both smoothed over ``IMPULSE_SAMPLES``, that no burst leaves so briefly."""
+
+IMPULSE_SAMPLES = 8
+
+IMPULSE_SHARE = 0.15
+"""Of a burst's length: the longest impulse; of an epoch: the most that is set aside."""
+
+MOST_PATHS = 12
 """Of one burst."""
 
-ROUGH_ITERATIONS = 3
+ROUGH_ITERATIONS = 2
 FULL_ITERATIONS = 12
 """Of the joint refinement while paths are still being found, and when all are."""
 
-MOST_ROUNDS = 40
-"""Of searching in what is left: a bound on the work, not expected to be met."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Sound:
-    """One path of one emitter's burst, as far as it is known.
+    """One path of one emitter's burst, as it was found.
 
-    ``power`` is its correlation power when it was found, ``clear`` whether that stood above the threshold at once; if
-    not, it must stand ``threshold`` times above the noise when all else is taken away. ``covariance`` (2, 2) is that of
-    arrival and β, ``noise`` the white-equivalent power left around it.
+    ``power`` is its correlation power then, ``clear`` whether that stood out and above the threshold at once; if not,
+    it must stand ``threshold`` times above the noise when all else is taken away.
     """
 
     bank: Bank
-    burst: Burst
     power: float
     threshold: float
     clear: bool
-    covariance: Floats
-    noise: float
-
-    @property
-    def begins_s(self) -> float:
-        """When its first chip is heard."""
-        return self.burst.arrival_s - self.burst.waveform.duration_s / 2
-
-    @property
-    def ends_s(self) -> float:
-        """When its last chip has rung off, slowed by 1 % at most."""
-        w = self.burst.waveform
-        return self.begins_s + 1.01 * (len(w.envelope) / w.rate_hz + w.start_s)
-
-    @property
-    def energy(self) -> float:
-        """Of its signature, as a matched filter sees it."""
-        return abs(self.burst.gain) ** 2 * self.bank.energy
 
 
 class Separation:
@@ -111,176 +104,284 @@ class Separation:
     ) -> None:
         self.band, self.banks, self.windows = band, banks, windows
         self.baseband, self.start_s = baseband, start_s
-        self.sound_speed_mps, self.kappa_sd, self.false_alarm_rate = sound_speed_mps, kappa_sd, false_alarm_rate
+        self.sound_speed_mps, self.false_alarm_rate = sound_speed_mps, false_alarm_rate
         self.tones = tones
+        self.notes: list[str] = []
         self.sounds: list[Sound] = []
-        self.residual: NDArray[np.complexfloating] = baseband - self._tone()
+        self.joint = Joint(
+            baseband - self._tone(), start_s, band.rate_hz, kappa_sd, band.whiteness, max(1, 2 * len(banks))
+        )
         self._floor = self._margin_power()
+        self._predictions: Mapping[str, Prediction] = {}
 
     def run(self, predictions: Mapping[str, Prediction]) -> None:
         """Find all there is: first where it is predicted, then, if that does not explain what is heard, everywhere."""
-        warm = dict(predictions)
-        for _ in range(MOST_ROUNDS):
-            disturbed = bool(self.sounds) and self._power_left() > UNEXPLAINED * self._floor
-            peaks = [
-                (bank, peak)
-                for bank in self.banks
-                if (peak := self._look(bank, warm, echoes=disturbed and not warm)) is not None
-            ]
-            if peaks:
-                strongest = max(peak.power for _, peak in peaks)
-                self._accept([(bank, peak) for bank, peak in peaks if peak.power >= NEAR_STRONGEST * strongest])
-            elif warm and (disturbed or not self.sounds):
-                warm = {}
-            elif disturbed or not self.sounds:
-                # nothing stands out of the crowd, if there is one: begin with its loudest
-                crowd = [(bank, p) for bank in self.banks if (p := self._look(bank, warm, False, by_margins=True))]
-                if not crowd:
-                    break
-                self._accept([max(crowd, key=lambda found: found[1].power)])
-            else:
-                break
+        if not self.banks:
+            return
+        self._predictions = predictions
+        self._take_beacons(predictions)
+        if predictions and not self.sounds:
+            self._predictions = {}
+            self._take_beacons({})
+        self._leave_out_impulses()
+        self._take_crowd()
         self._prune()
+        if self._disturbed():
+            self._verify()
 
-    def detections(self, receiver: str) -> list[Detection]:
-        """Report each emitter by its first path of weight, where the samples hold that whole."""
-        out = []
-        for bank in self.banks:
-            own = [s for s in self.sounds if s.bank is bank]
-            if not own:
-                continue
-            strongest = max(s.energy for s in own)
-            first = min((s for s in own if s.energy >= PATH_POWER * strongest), key=lambda s: s.burst.arrival_s)
-            if self._whole(first):
-                out.append(_detection(first, own, receiver, self.band))
-        return out
+    def _leave_out_impulses(self) -> None:
+        """Set aside clicks and drop-outs: what is far above the rest of what is left, for far shorter than a burst."""
+        if not (self.sounds and self._disturbed()):
+            return
+        power = np.abs(self.joint.residual) ** 2
+        smooth = np.convolve(power, np.ones(IMPULSE_SAMPLES) / IMPULSE_SAMPLES, "same")
+        loud = smooth > IMPULSE * np.median(smooth[smooth > 0])
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], loud, [False]])))
+        longest = IMPULSE_SHARE * min(b.waveform.duration_s for b in self.joint.bursts) * self.band.rate_hz
+        aside = np.zeros(len(loud), bool)
+        runs = [(a, b) for a, b in edges.reshape(-1, 2) if b - a <= longest]
+        for begin, end in runs:
+            aside[begin:end] = True
+        # what echoes leave has its peaks too, but not most of its power in them
+        if np.mean(aside) > IMPULSE_SHARE or np.sum(power[aside]) < 0.5 * np.sum(power):
+            return
+        self.joint.leave_out(aside)
+        self._settle(FULL_ITERATIONS)
+        lasted_ms = 1e3 * np.sum(aside) / self.band.rate_hz
+        self.notes.append(f"{len(runs)} clicks or drop-outs, {lasted_ms:.0f} ms in all, were left out")
 
-    def _look(
-        self, bank: Bank, predictions: Mapping[str, Prediction], echoes: bool, by_margins: bool = False
-    ) -> Peak | None:
+    def _verify(self) -> None:
+        """Drop bursts that stand no higher than other peaks of their code do, in what all other bursts leave."""
+        doubtful = set(self.windows)
+        while doubtful:
+            dropped = [i for i, s in enumerate(self.sounds) if s.bank.emitter in doubtful and not self._stands_out(i)]
+            doubtful = {self.sounds[i].bank.emitter for i in dropped}
+            if dropped:
+                self._keep([i for i in range(len(self.sounds)) if i not in dropped])
+                self._prune()
+
+    def _stands_out(self, i: int) -> bool:
+        bank = self.sounds[i].bank
+        known_s = [self._begins_s(k) for k, s in enumerate(self.sounds) if s.bank is bank and k != i]
+        heard = self.joint.residual_with(i)
+        peak = search(heard, self.start_s, bank, self.band, *self.windows[bank.emitter], known_s, self.false_alarm_rate)
+        return peak is not None and self._energy(i) > STANDS_OUT * peak.second
+
+    def _keep(self, which: list[int]) -> None:
+        self.sounds = [self.sounds[i] for i in which]
+        self.joint.keep(which)
+
+    def _take_beacons(self, predictions: Mapping[str, Prediction]) -> None:
+        """Accept what stands out, and search the rest in what is left."""
+        while True:
+            missing = [bank for bank in self.banks if not any(s.bank is bank for s in self.sounds)]
+            found = [(bank, peak) for bank in missing if (peak := self._look(bank, predictions)) is not None]
+            if not found:
+                return
+            strongest = max(peak.power for _, peak in found)
+            sure = [
+                (bank, peak)
+                for bank, peak in found
+                if peak.power > peak.threshold * peak.noise
+                and peak.power > (STANDS_OUT if peak.power >= NEAR_STRONGEST * strongest else ALONE) * peak.second
+            ]
+            if not sure:
+                # a prediction leaves little room for anything else; without, the loudest of a crowd may be an echo
+                if self._disturbed() and not predictions:
+                    return
+                sure = [max(found, key=lambda one: one[1].power)]
+            self._accept(sure)
+
+    def _take_crowd(self) -> None:
+        """Accept paths of all bursts, one at a time, while more remains than noise."""
+        last: dict[str, Peak | None] = {}
+        while self._disturbed() and len(self.sounds) < MOST_PATHS * len(self.banks):
+            # a burst taken away leaves less for all others: what they had before bounds what they have now
+            fresh: set[str] = set()
+            while True:
+                waiting = [b for b in self.banks if b.emitter not in last or last[b.emitter] is not None]
+                if not waiting:
+                    return
+                bank = max(waiting, key=lambda b: p.power if (p := last.get(b.emitter)) else np.inf)
+                if bank.emitter in fresh:
+                    break
+                last[bank.emitter] = self._look(bank, self._predictions, True) or self._look(bank, {}, True)
+                fresh.add(bank.emitter)
+            peak = last[bank.emitter]
+            assert peak is not None
+            self._accept([(bank, peak)])
+
+    def _look(self, bank: Bank, predictions: Mapping[str, Prediction], echoes: bool = False) -> Peak | None:
         """Search one emitter in what is left; None where nothing is worth trying."""
-        own = [s for s in self.sounds if s.bank is bank]
-        if own and (not echoes or len(own) >= MOST_PATHS):
+        own = [i for i, s in enumerate(self.sounds) if s.bank is bank]
+        if len(own) >= MOST_PATHS:
             return None
         opens_s, closes_s = self.windows[bank.emitter]
-        rates = None
-        expected = predictions.get(bank.emitter)
-        if expected is not None:
+        known_s = [self._begins_s(i) for i in own]
+        expected = None if any(self._awaited(i) for i in own) else predictions.get(bank.emitter)
+        left = self.joint.residual
+        if expected is None:
+            peak = search(left, self.start_s, bank, self.band, opens_s, closes_s, known_s, self.false_alarm_rate)
+        else:
             begins_s = expected.arrival_s - bank.waveform.duration_s / 2
-            reach_s = 5 * expected.arrival_sd_s + 2 / self.band.rate_hz
-            opens_s, closes_s = max(opens_s, begins_s - reach_s), min(closes_s, begins_s + reach_s)
+            reach_s = self._reach_s(expected)
             reach = 5 * expected.range_rate_sd_mps
-            rates = (expected.range_rate_mps - reach, expected.range_rate_mps + reach)
-        known_s = [s.begins_s for s in own]
-        peak = search(
-            self.residual, self.start_s, bank, self.band, opens_s, closes_s, rates, known_s, self.false_alarm_rate
-        )
+            peak = search_near(
+                left,
+                self.start_s,
+                bank,
+                self.band,
+                max(opens_s, begins_s - reach_s),
+                min(closes_s, begins_s + reach_s),
+                (expected.range_rate_mps - reach, expected.range_rate_mps + reach),
+                known_s,
+                self.false_alarm_rate,
+            )
         if peak is None:
             return None
         # many loud bursts at once raise the median that noise is judged by: the quiet margins know better
-        noise = min(peak.noise, self._floor * self.band.whiteness) if by_margins else peak.noise
+        noise = min(peak.noise, self._floor * self.band.whiteness) if echoes else peak.noise
         if peak.power < (peak.threshold if own else peak.worth_trying) * noise:
             return None
-        return peak if peak.power > PATH_POWER * max((s.power for s in own), default=0.0) else None
+        return peak if peak.power > ECHO_POWER * max((self.sounds[i].power for i in own), default=0.0) else None
 
     def _accept(self, found: list[tuple[Bank, Peak]]) -> None:
         for bank, peak in found:
             middle_s = peak.start_s + bank.waveform.duration_s / 2
-            burst = Burst(bank.waveform, middle_s, peak.range_rate_mps / self.sound_speed_mps, 0.0, 0j)
-            clear = peak.power > peak.threshold * peak.noise
-            self.sounds.append(Sound(bank, burst, peak.power, peak.threshold, clear, np.zeros((2, 2)), 0.0))
-        self._settle(ROUGH_ITERATIONS)
+            self.joint.add(Burst(bank.waveform, middle_s, peak.range_rate_mps / self.sound_speed_mps, 0.0, 0j))
+            clear = peak.power > peak.threshold * peak.noise and peak.power > STANDS_OUT * peak.second
+            self.sounds.append(Sound(bank, peak.power, peak.threshold, clear))
+        self._settle(ROUGH_ITERATIONS, STALE_RAD)
 
-    def _settle(self, iterations: int) -> None:
-        """Refine all paths together on the stretch in which any of them sounds, then the tones in what they leave."""
-        first, last = self._stretch()
-        clean = self.baseband - self._tone()
-        bursts, covariances, left, noise = refine(
-            clean[first:last],
-            self.start_s + first / self.band.rate_hz,
-            self.band.rate_hz,
-            [s.burst for s in self.sounds],
-            self.kappa_sd,
-            self.band.whiteness,
-            iterations,
-        )
-        self.sounds = [
-            replace(sound, burst=burst, covariance=covariance, noise=float(power))
-            for sound, burst, covariance, power in zip(self.sounds, bursts, covariances, noise, strict=True)
-        ]
-        self.residual = clean
-        self.residual[first:last] = left
+    def _settle(self, iterations: int, stale_rad: float = FRESH_RAD) -> None:
+        """Refine all paths together, then the tones in what they leave."""
+        self.joint.settle(iterations, stale_rad)
         if self.tones:
-            without_bursts = self.residual + self._tone()
-            self.tones = refit(self.tones, without_bursts, self.band.rate_hz)
-            self.residual = without_bursts - self._tone()
+            self.tones = refit(self.tones, self.joint.residual + self._tone(), self.band.rate_hz)
+            self.joint.replace_baseband(self.baseband - self._tone())
 
     def _prune(self) -> None:
         """Drop what was only tried and does not stand out even now that all else is gone."""
         while self.sounds:
             self._settle(FULL_ITERATIONS)
+            noise = self.joint.noise()
+            energy = np.array([self._energy(i) for i in range(len(self.sounds))])
             # beside what no burst explains, a weak peak may be part of it, however clear it looked
-            disturbed = self._power_left() > UNEXPLAINED * self._floor
-            weak = RESIDUE * max(s.energy for s in self.sounds) if disturbed else 0.0
-            sure = [s for s in self.sounds if (s.clear and s.energy >= weak) or s.energy > s.threshold * s.noise]
+            weak = RESIDUE * float(np.max(energy)) if self._disturbed() else 0.0
+            sure = [
+                i
+                for i, s in enumerate(self.sounds)
+                if (s.clear and energy[i] >= weak) or energy[i] > s.threshold * noise[i]
+            ]
             if len(sure) == len(self.sounds):
                 break
-            self.sounds = sure
+            self._keep(sure)
+
+    def detections(self, receiver: str) -> list[Detection]:
+        """Report each emitter by its first path of weight, where the samples hold that whole."""
+        out = []
+        noise = self.joint.noise()
+        covariances = self.joint.covariances(noise)
+        for bank in self.banks:
+            own = [i for i, s in enumerate(self.sounds) if s.bank is bank]
+            if not own:
+                continue
+            strongest = max(self._energy(i) for i in own)
+            weighty = [i for i in own if self._energy(i) >= PATH_POWER * strongest and self._awaited(i)]
+            if not weighty:
+                continue
+            first = min(weighty, key=lambda i: self.joint.bursts[i].arrival_s)
+            if self._whole(first):
+                bursts = [self.joint.bursts[i] for i in own]
+                out.append(
+                    _detection(
+                        bank.emitter,
+                        self.joint.bursts[first],
+                        bursts,
+                        covariances[first],
+                        float(noise[first]) / self.band.whiteness,
+                        receiver,
+                    )
+                )
+        return out
+
+    def _reach_s(self, expected: Prediction) -> float:
+        """How far from its predicted arrival a burst is looked for."""
+        return 5 * expected.arrival_sd_s + 2 / self.band.rate_hz
+
+    def _awaited(self, i: int) -> bool:
+        """Whether burst i came when its emitter's direct path was predicted, or nothing was."""
+        expected = self._predictions.get(self.sounds[i].bank.emitter)
+        if expected is None:
+            return True
+        return abs(self.joint.bursts[i].arrival_s - expected.arrival_s) <= 1.2 * self._reach_s(expected)
+
+    def _begins_s(self, i: int) -> float:
+        """When the first chip of burst i is heard."""
+        burst = self.joint.bursts[i]
+        return burst.arrival_s - burst.waveform.duration_s / 2
+
+    def _energy(self, i: int) -> float:
+        """Of burst i's signature, as a matched filter sees it."""
+        return abs(self.joint.bursts[i].gain) ** 2 * self.sounds[i].bank.energy
 
     def _tone(self) -> NDArray[np.complexfloating]:
         return sum((tone.course for tone in self.tones), np.zeros_like(self.baseband))
 
-    def _stretch(self) -> tuple[int, int]:
-        """Samples in which any burst sounds."""
-        begins_s = min(s.begins_s for s in self.sounds) - 2e-3
-        ends_s = max(s.ends_s for s in self.sounds)
-        first = max(0, int((begins_s - self.start_s) * self.band.rate_hz))
-        return first, max(first + 1, int((ends_s - self.start_s) * self.band.rate_hz) + 1)
-
     def _margin_power(self) -> float:
         """Noise power by the quieter of the two margins of the epoch."""
-        sounding = self.residual[self.baseband != 0]
+        sounding = self.joint.residual[self.baseband != 0]
         edge = int(MARGIN_S * self.band.rate_hz)
         margins = [part for part in (sounding[:edge], sounding[-edge:]) if len(part)]
         return min((float(np.mean(np.abs(part) ** 2)) for part in margins), default=0.0)
 
-    def _power_left(self) -> float:
-        """Power left while bursts sound."""
-        first, last = self._stretch()
-        left = self.residual[first:last]
-        return float(np.mean(np.abs(left) ** 2)) if len(left) else 0.0
+    def _disturbed(self) -> bool:
+        """Whether more is left, while bursts sound, than their quiet margins have."""
+        first, last = 0, len(self.baseband)
+        if self.sounds:
+            begins_s = min(self._begins_s(i) for i in range(len(self.sounds))) - 2e-3
+            ends_s = max(
+                self._begins_s(i) + 1.01 * (len(b.waveform.envelope) / b.waveform.rate_hz + b.waveform.start_s)
+                for i, b in enumerate(self.joint.bursts)
+            )
+            first = max(0, int((begins_s - self.start_s) * self.band.rate_hz))
+            last = int((ends_s - self.start_s) * self.band.rate_hz) + 1
+        left = self.joint.residual[first:last]
+        return bool(len(left)) and float(np.mean(np.abs(left) ** 2)) > UNEXPLAINED * self._floor
 
-    def _whole(self, sound: Sound) -> bool:
+    def _whole(self, i: int) -> bool:
         """Whether the recording, which begins at 0, holds a burst from its first chip to its last.
 
         Where the epoch began before the recording, an earlier path of a burst near its beginning may have been missed.
         """
-        half_s = sound.burst.waveform.duration_s / 2
+        burst = self.joint.bursts[i]
+        half_s = burst.waveform.duration_s / 2
         end_s = self.start_s + len(self.baseband) / self.band.rate_hz
-        guard_s = min(half_s, 5e-3) if self.windows[sound.bank.emitter][0] < 0 else 0.0
-        return sound.begins_s >= max(self.start_s, guard_s) and sound.burst.arrival_s + half_s <= end_s
+        guard_s = min(half_s, 5e-3) if self.windows[self.sounds[i].bank.emitter][0] < 0 else 0.0
+        return self._begins_s(i) >= max(self.start_s, guard_s) and burst.arrival_s + half_s <= end_s
 
 
-def _detection(first: Sound, own: list[Sound], receiver: str, band: Band) -> Detection:
-    burst, w = first.burst, first.burst.waveform
+def _detection(
+    emitter: str, burst: Burst, own: list[Burst], covariance: Floats, noise: float, receiver: str
+) -> Detection:
+    w = burst.waveform
     inside = slice(int(-w.start_s * w.rate_hz), int((w.duration_s - w.start_s) * w.rate_hz))
     power = abs(burst.gain) ** 2 * float(np.mean(np.abs(w.envelope[inside]) ** 2))
-    in_band = first.noise / band.whiteness
     paths = tuple(
         Path(
-            s.burst.arrival_s - burst.arrival_s,
-            float(20 * np.log10(max(abs(s.burst.gain), 1e-12) / max(abs(burst.gain), 1e-12))),
+            b.arrival_s - burst.arrival_s,
+            float(20 * np.log10(max(abs(b.gain), 1e-12) / max(abs(burst.gain), 1e-12))),
         )
-        for s in own
+        for b in own
     )
     return Detection(
-        emitter=first.bank.emitter,
+        emitter=emitter,
         receiver=receiver,
         arrival_s=burst.arrival_s,
         time_scale=1.0 - burst.beta,
         # β and the time scale differ in sign
-        covariance=first.covariance * np.array([[1.0, -1.0], [-1.0, 1.0]]),
+        covariance=covariance * np.array([[1.0, -1.0], [-1.0, 1.0]]),
         amplitude=abs(burst.gain),
-        snr_db=float(10 * np.log10(max(power, 1e-30) / in_band)),
+        snr_db=float(10 * np.log10(max(power, 1e-30) / noise)),
         paths=paths,
     )
