@@ -330,3 +330,130 @@ class Step:
     events: tuple[Event, ...]
     range_used: NDArray[np.bool_]
     range_clock_offset_m: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pace:
+    """How a beacon keeps time: its bursts against the schedule that it should follow.
+
+    With a sync command the schedule is those commands; else it is the nominal period. ``rate`` and ``drift_per_s`` are
+    fitted to ``late_s`` as a straight line or, where that is significant, a parabola; both are stated for the middle.
+
+    Attributes
+    ----------
+    scheduled_s : float64 (n,)
+        When each burst was due, in order, up to a constant where nothing synchronises.
+    late_s : float64 (n,)
+        Measured less due, less its mean.
+    residual_s : float64 (n,)
+        What the fit leaves.
+    used : bool (n,)
+        Whether the burst entered fit and average.
+    rate, rate_sd : float
+        Relative excess of the period: positive when bursts come ever later.
+    drift_per_s, drift_sd_per_s : float or None
+        Change of ``rate`` a second; None where a straight line does.
+    jitter_s : float
+        Root mean square of the residuals of used bursts.
+    allan_tau_s, allan : float64 (m,)
+        Allan deviation of the relative period (IEEE 1139) at spans of 1, 2, 4, … bursts.
+    """
+
+    scheduled_s: Floats
+    late_s: Floats
+    residual_s: Floats
+    used: NDArray[np.bool_]
+    rate: float
+    rate_sd: float
+    drift_per_s: float | None
+    drift_sd_per_s: float | None
+    jitter_s: float
+    allan_tau_s: Floats
+    allan: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """A beacon's burst as one microphone heard it at rest, learnt from many.
+
+    Attributes
+    ----------
+    beacon, microphone : str
+    burst : ReferenceBurst
+        One burst, of peak 0.9. It was sent ``start_s`` after the first sample and stands there as if heard from
+        ``flight_m``: next to nothing, since a flight inside would carry the calibration's air to every later day.
+    start_s, flight_m : float
+    waveform : Waveform
+        What a receiver makes of ``burst``.
+    nominal : Waveform or None
+        What the site file says of the burst; None where its code is not known.
+    heard : int
+        Bursts found.
+    left_out : mapping from reason to count
+        Bursts that did not enter the average.
+    amplitude, amplitude_sd : float
+        Peak of the envelope at the microphone, full scale 1, and its deviation from burst to burst.
+    snr_db, snr_gain_db : float
+        Mean burst power over the noise in ``band_hz`` for one burst, and what averaging added.
+    band_hz : (float, float)
+        What was listened to.
+    match : float or None
+        Correlation of the learnt with the nominal envelope: 1 where only delay, strength and phase differ.
+    stretch, stretch_sd : float or None
+        Relative excess of the carrier over the nominal, as a clock or a motion makes it.
+    delay_s : float or None
+        How much later than commanded the sound leaves the beacon; None where no command or no distance is known.
+    delay_sd_s : float or None
+        By noise and jitter alone.
+    delay_total_sd_s : float or None
+        With the doubts about distance and sound speed, which all bursts share.
+    distance_m, distance_sd_m, sound_speed_mps : float
+        What the delay rests on; the distance is None where it is not known.
+    period_s : float
+        Nominal.
+    pace : Pace
+    response_s, response : float64 (r,), complex128 (r,) or None
+        What one chip (or an impulse of a chirp) sounds like, its time from the chip's start; None where the code is
+        not known.
+    gate_s : float or None
+        Until when the response entered ``burst``; None where the plain average did.
+    echoes : tuple of Path
+        Later than the gate, strongest first.
+    residual_s, residual_rms, noise_rms : float64 (m,), (m,), float
+        Root mean square of what single bursts leave beside the average, over burst time; and that before the burst.
+    flags : tuple of str
+    """
+
+    beacon: str
+    microphone: str
+    burst: ReferenceBurst
+    start_s: float
+    flight_m: float
+    waveform: Waveform
+    nominal: Waveform | None
+    heard: int
+    left_out: Mapping[str, int]
+    amplitude: float
+    amplitude_sd: float
+    snr_db: float
+    snr_gain_db: float
+    band_hz: tuple[float, float]
+    match: float | None
+    stretch: float | None
+    stretch_sd: float | None
+    delay_s: float | None
+    delay_sd_s: float | None
+    delay_total_sd_s: float | None
+    distance_m: float | None
+    distance_sd_m: float
+    sound_speed_mps: float
+    period_s: float
+    pace: Pace
+    response_s: Floats | None
+    response: NDArray[np.complex128] | None
+    gate_s: float | None
+    echoes: tuple[Path, ...]
+    residual_s: Floats
+    residual_rms: Floats
+    noise_rms: float
+    flags: tuple[str, ...] = ()

@@ -9,7 +9,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from sonofix.cli.calibrate import calibrate
 from sonofix.cli.check import check
+from sonofix.cli.codes import codes
 from sonofix.cli.console import Stopped
 from sonofix.cli.demo import demo
 from sonofix.cli.run import run
@@ -96,7 +98,7 @@ def sonofix(
     """Positioning by sound: from microphone samples to a fused track."""
 
 
-for command in (run, check, simulate, score, demo):
+for command in (run, check, simulate, score, codes, calibrate, demo):
     app.command()(command)
 
 
