@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from sonofix.geometry import POSE, Links, from_arm, link, model, open_arms, row_times, turning
+from sonofix.geometry import POSE, Links, from_arm, link, model, open_arms, row_times, rows_at, turning
 from sonofix.records import Floats
 from sonofix.site import Site
 
@@ -197,6 +197,21 @@ def test_kernel_matches_its_plain_twin(rng: np.random.Generator) -> None:
             np.testing.assert_allclose(built, plain, atol=1e-6)
 
 
+@pytest.mark.parametrize("rates", [False, True])
+@pytest.mark.parametrize("clock", [False, True])
+def test_rows_at_stacks_ranges_and_rates_and_adds_the_clock(clock: bool, rates: bool) -> None:
+    links, times = links_of(*CASES.values()), np.linspace(-0.2, 0.2, len(CASES))
+    state, n = np.append(POSES, [3.5, 0.25]), len(CASES)
+    value, derivative = rows_at(links, state, times, SPEED, clock, rates)
+    range_m, rate, by_range, by_rate = model(links, POSES, times, SPEED)
+    offset, drift = (3.5, 0.25) if clock else (0.0, 0.0)
+    np.testing.assert_array_equal(value, np.concatenate([range_m + offset, rate + drift])[: n * (1 + rates)])
+    whole = np.zeros((2 * n, 18))
+    whole[:n, :16], whole[n:, :16] = by_range.reshape(n, -1), by_rate.reshape(n, -1)
+    whole[:n, 16] = whole[n:, 17] = clock
+    np.testing.assert_array_equal(derivative, whole[: n * (1 + rates)])
+
+
 # --- looking rows up --------------------------------------------------------------------------------------------------
 
 
@@ -227,6 +242,24 @@ def test_link_finds_both_ends_of_each_row() -> None:
     assert links.receiver_point.tolist() == [[0.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.5]]
     assert links.emitter_sd_m.tolist() == [0.02, 0.0, 0.0]
     assert len(links) == 3
+
+
+def test_sites_with_the_same_names_are_not_mixed_up() -> None:
+    site = make_site()
+    moved = site.model_copy(
+        update={"beacons": (site.beacons[0].model_copy(update={"position_m": (7.0, 8.0, 9.0)}), site.beacons[1])}
+    )
+    for _ in range(2):
+        assert link(site, ("wall",), ("ear",)).emitter_point.tolist() == [[1.0, 2.0, 3.0]]
+        assert link(moved, ("wall",), ("ear",)).emitter_point.tolist() == [[7.0, 8.0, 9.0]]
+
+
+def test_links_and_arms_are_the_callers_own() -> None:
+    site = make_site()
+    link(site, ("wall",), ("ear",)).emitter_point[:] = 0.0
+    assert link(site, ("wall",), ("ear",)).emitter_point.tolist() == [[1.0, 2.0, 3.0]]
+    with pytest.raises(ValueError, match="read-only"):
+        open_arms(site)[0] = 1.0
 
 
 def test_link_of_no_rows_is_empty() -> None:

@@ -7,6 +7,8 @@ Vehicles move straight and turn evenly about a reference instant; a node's place
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from math import hypot
 
 import numba
 import numpy as np
@@ -49,6 +51,11 @@ class Links:
         """Return the number of rows."""
         return len(self.emitter_vehicle)
 
+    @property
+    def ends(self) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64], Floats]:
+        """What the kernels take."""
+        return self.emitter_vehicle, self.emitter_point, self.receiver_vehicle, self.receiver_point
+
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Links:
         """Return some of the rows."""
         return Links(
@@ -60,28 +67,76 @@ class Links:
         )
 
 
+class _Same:
+    """A site as a key, by identity: comparing all that it holds would take longer than looking it up anew."""
+
+    __slots__ = ("site",)
+
+    def __init__(self, site: Site) -> None:
+        self.site = site
+
+    def __hash__(self) -> int:
+        return id(self.site)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.site is self.site
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ends:
+    """All beacons or all microphones of a site: where in the arrays each id stands, what carries it, and its place."""
+
+    index: dict[str, int]
+    vehicle: NDArray[np.int64]
+    point: Floats
+    sd_m: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Roster:
+    """What rows are looked up in, gathered once a site (a site never changes)."""
+
+    emitters: _Ends
+    receivers: _Ends
+    arms: Floats
+    turns: NDArray[np.bool_]
+
+
+@lru_cache(maxsize=8)
+def _roster(key: _Same) -> _Roster:
+    site = key.site
+    nodes = (*site.beacons, *site.microphones)
+    vehicles = {v.id: i for i, v in enumerate(site.vehicles)}
+    arms, turns = np.zeros((len(vehicles), 2)), np.zeros(len(vehicles), bool)
+    for vehicle, i in vehicles.items():
+        flat = np.array([n.lever_arm_m[:2] for n in nodes if n.vehicle == vehicle]).reshape(-1, 2)
+        turns[i] = len(flat) > 0 and bool(np.any(np.hypot(*(flat - flat[0]).T) >= SAME_ARM_M))
+        if len(flat) and not turns[i]:
+            arms[i] = flat[0]
+    arms.flags.writeable = turns.flags.writeable = False
+    left_out = np.vstack([np.column_stack([arms, np.zeros(len(arms))]), np.zeros((1, 3))])
+
+    def ends(some: tuple[Beacon, ...] | tuple[Microphone, ...]) -> _Ends:
+        carrier = np.array([-1 if n.vehicle is None else vehicles[n.vehicle] for n in some], np.int64)
+        point = np.array([n.position_m or n.lever_arm_m for n in some], float).reshape(-1, 3)
+        sd_m = np.array([n.position_sd_m if isinstance(n, Beacon) else 0.0 for n in some], float)
+        return _Ends({n.id: i for i, n in enumerate(some)}, carrier, point - left_out[carrier], sd_m)
+
+    return _Roster(ends(site.beacons), ends(site.microphones), arms, turns)
+
+
 def open_arms(site: Site) -> Floats:
     """Horizontal lever arms (V, 2) that no heading places: of vehicles whose ends all sit on one vertical line.
 
     Nothing tells such a vehicle's heading, so its motion is followed at that line (`link` gives its ends so), and
     `from_arm` goes back to its origin.
     """
-    arms = np.zeros((len(site.vehicles), 2))
-    turns = turning(site)
-    for i, vehicle in enumerate(site.vehicles):
-        ends = [n.lever_arm_m[:2] for n in (*site.beacons, *site.microphones) if n.vehicle == vehicle.id]
-        if ends and not turns[i]:
-            arms[i] = ends[0]
-    return arms
+    return _roster(_Same(site)).arms
 
 
 def turning(site: Site) -> NDArray[np.bool_]:
     """Whether each vehicle's ends tell its heading (V,): they sit on more than one vertical line."""
-    out = np.zeros(len(site.vehicles), bool)
-    for i, vehicle in enumerate(site.vehicles):
-        ends = np.array([n.lever_arm_m[:2] for n in (*site.beacons, *site.microphones) if n.vehicle == vehicle.id])
-        out[i] = len(ends) > 0 and bool(np.any(np.hypot(*(ends - ends[0]).T) >= SAME_ARM_M))
-    return out
+    return _roster(_Same(site)).turns
 
 
 def from_arm(arm: Floats, velocity: Floats) -> tuple[Floats, float]:
@@ -89,8 +144,7 @@ def from_arm(arm: Floats, velocity: Floats) -> tuple[Floats, float]:
 
     A vehicle that drives is taken to look where it goes, within 0.1 rad; one that stands may look anywhere.
     """
-    length = float(np.hypot(arm[0], arm[1]))
-    speed = float(np.hypot(velocity[0], velocity[1]))
+    length, speed = hypot(arm[0], arm[1]), hypot(velocity[0], velocity[1])
     if speed < DRIVING_MPS or not length:
         return np.zeros(2), length
     along = velocity[:2] / speed
@@ -105,36 +159,40 @@ def link(site: Site, emitters: tuple[str, ...], receivers: tuple[str, ...]) -> L
     KeyError
         If an id is not in the site.
     """
-    vehicles = {v.id: i for i, v in enumerate(site.vehicles)}
-    arms = np.vstack([np.column_stack([open_arms(site), np.zeros(len(vehicles))]), np.zeros((1, 3))])
+    roster = _roster(_Same(site))
+    sending, hearing = roster.emitters, roster.receivers
+    try:
+        sent = [sending.index[e] for e in emitters]
+        heard = [hearing.index[r] for r in receivers]
+    except KeyError:
+        for e in emitters:
+            site.beacon(e)
+        for r in receivers:
+            site.microphone(r)
+        raise
+    e, r = np.array(sent, np.int64), np.array(heard, np.int64)
+    return Links(sending.vehicle[e], sending.point[e], hearing.vehicle[r], hearing.point[r], sending.sd_m[e])
 
-    def ends(nodes: list[Beacon] | list[Microphone]) -> tuple[NDArray[np.int64], Floats]:
-        carrier = np.array([-1 if n.vehicle is None else vehicles[n.vehicle] for n in nodes], np.int64)
-        point = np.array([n.position_m or n.lever_arm_m for n in nodes], float).reshape(-1, 3)
-        return carrier, point - arms[carrier]
 
-    beacons = [site.beacon(e) for e in emitters]
-    emitter_vehicle, emitter_point = ends(beacons)
-    receiver_vehicle, receiver_point = ends([site.microphone(r) for r in receivers])
-    sd = np.array([b.position_sd_m for b in beacons], float)
-    return Links(emitter_vehicle, emitter_point, receiver_vehicle, receiver_point, sd)
-
-
-@numba.njit(cache=True)
-def _place(vehicle, point, pose, at, dt, out):
+@numba.njit(cache=True, error_model="numpy")
+def _place(vehicle, point, state, dt, out):
     """Place, velocity and their derivatives by yaw of one end of a row: rows 0 to 3 of ``out`` (4, 3)."""
-    out[:] = 0.0
-    if vehicle < 0:
-        out[0] = point
-        return
-    yaw_rate = pose[at, 7]
-    yaw = pose[at, 3] + yaw_rate * dt
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    east = cos * point[0] - sin * point[1]
-    north = sin * point[0] + cos * point[1]
     for axis in range(3):
-        out[0, axis] = pose[at, axis] + pose[at, 4 + axis] * dt
-        out[1, axis] = pose[at, 4 + axis]
+        out[0, axis] = point[axis]
+        out[1, axis] = out[2, axis] = out[3, axis] = 0.0
+    if vehicle < 0:
+        return
+    at = 8 * vehicle
+    yaw_rate = state[at + 7]
+    east = north = 0.0
+    if point[0] != 0.0 or point[1] != 0.0:
+        yaw = state[at + 3] + yaw_rate * dt
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        east = cos * point[0] - sin * point[1]
+        north = sin * point[0] + cos * point[1]
+    for axis in range(3):
+        out[0, axis] = state[at + axis] + state[at + 4 + axis] * dt
+        out[1, axis] = state[at + 4 + axis]
     out[0, 0] += east
     out[0, 1] += north
     out[0, 2] += point[2]
@@ -144,21 +202,45 @@ def _place(vehicle, point, pose, at, dt, out):
     out[3, 0], out[3, 1] = -yaw_rate * east, -yaw_rate * north
 
 
-@numba.njit(cache=True)
-def _fill(
-    emitter_vehicle, emitter_point, receiver_vehicle, receiver_point, pose, dt, c, range_m, rate, by_range, by_rate
-):
-    """Fill what `model` returns, row by row."""
+@numba.njit(cache=True, error_model="numpy")
+def expected(ends, state, dt, c, clock, value, derivative):
+    """What rows would show at a state, and its derivative: the kernel that `model`, fixes and tracks share.
+
+    Kernels that call this keep a copy of it in their own cache, which does not notice a change here.
+
+    Parameters
+    ----------
+    ends : tuple
+        ``emitter_vehicle, emitter_point, receiver_vehicle, receiver_point`` of `Links`, n rows.
+    state : float64 (8 V + 2,)
+        Each vehicle's ``POSE``, then the offset (m) and drift (m/s) of the clock that ranges share, if ``clock``.
+    dt : float64 (n,)
+        When each row was heard, from the instant the state belongs to.
+    c : float
+        Sound speed.
+    value : float64 (m,), out
+        Ranges and then, where it is m = 2 n long, range rates.
+    derivative : float64 (m, 8 V + 2), out
+    """
+    emitter_vehicle, emitter_point, receiver_vehicle, receiver_point = ends
     here, there = np.empty((4, 3)), np.empty((4, 3))
     unit, across = np.empty(3), np.empty(3)
-    for i in range(len(dt)):
-        _place(receiver_vehicle[i], receiver_point[i], pose, receiver_vehicle[i], dt[i], here)
+    n, last = len(dt), len(state) - 1
+    rates = len(value) > n
+    derivative[:] = 0.0
+    for i in range(n):
+        _place(receiver_vehicle[i], receiver_point[i], state, dt[i], here)
         sent = dt[i]
         distance = 0.0
         for _ in range(4):  # contracts by v/c each time: 1e-9 of the range at 3 m/s
-            _place(emitter_vehicle[i], emitter_point[i], pose, emitter_vehicle[i], sent, there)
-            distance = np.sqrt(np.sum((here[0] - there[0]) ** 2))
+            _place(emitter_vehicle[i], emitter_point[i], state, sent, there)
+            distance = 0.0
+            for axis in range(3):
+                distance += (here[0, axis] - there[0, axis]) ** 2
+            distance = np.sqrt(distance)
             sent = dt[i] - distance / c
+            if emitter_vehicle[i] < 0:
+                break
         distance = max(distance, 1e-6)
         closing = 0.0
         drag = 0.0
@@ -168,14 +250,23 @@ def _fill(
             drag += unit[axis] * there[1, axis]
         # how the range answers to its own delay: a moving emitter was elsewhere when it sent
         lag = 1.0 / (1.0 - drag / c)
-        range_m[i] = distance
-        rate[i] = lag * closing
+        value[i] = distance
+        if clock:
+            value[i] += state[last - 1]
+            derivative[i, last - 1] = 1.0
+        if rates:
+            value[n + i] = lag * closing
+            if clock:
+                # the drift's own part in the ranges of one epoch is far below any range's deviation
+                value[n + i] += state[last]
+                derivative[n + i, last] = 1.0
         for axis in range(3):
             across[axis] = (here[1, axis] - there[1, axis] - closing * unit[axis]) / distance
         for end in range(2):
             vehicle = receiver_vehicle[i] if end == 0 else emitter_vehicle[i]
             if vehicle < 0:
                 continue
+            at = 8 * vehicle
             k = lag if end == 0 else -lag
             when = dt[i] if end == 0 else sent
             turned = here if end == 0 else there
@@ -184,14 +275,26 @@ def _fill(
             for axis in range(3):
                 turn += unit[axis] * turned[2, axis]
                 rate_turn += across[axis] * turned[2, axis] + unit[axis] * turned[3, axis]
-                by_range[i, vehicle, axis] += k * unit[axis]
-                by_range[i, vehicle, 4 + axis] += k * when * unit[axis]
-                by_rate[i, vehicle, axis] += k * across[axis]
-                by_rate[i, vehicle, 4 + axis] += k * (unit[axis] + when * across[axis])
-            by_range[i, vehicle, 3] += k * turn
-            by_range[i, vehicle, 7] += k * when * turn
-            by_rate[i, vehicle, 3] += k * rate_turn
-            by_rate[i, vehicle, 7] += k * (turn + when * rate_turn)
+                derivative[i, at + axis] += k * unit[axis]
+                derivative[i, at + 4 + axis] += k * when * unit[axis]
+            derivative[i, at + 3] += k * turn
+            derivative[i, at + 7] += k * when * turn
+            if rates:
+                for axis in range(3):
+                    derivative[n + i, at + axis] += k * across[axis]
+                    derivative[n + i, at + 4 + axis] += k * (unit[axis] + when * across[axis])
+                derivative[n + i, at + 3] += k * rate_turn
+                derivative[n + i, at + 7] += k * (turn + when * rate_turn)
+
+
+def rows_at(
+    links: Links, state: Floats, dt: Floats, sound_speed_mps: float, clock: bool, rates: bool
+) -> tuple[Floats, Floats]:
+    """Run `expected` into new arrays: what rows would show (m,) and its derivative (m, 8 V + 2)."""
+    m = len(dt) * (2 if rates else 1)
+    value, derivative = np.empty(m), np.empty((m, len(state)))
+    expected(links.ends, state, dt, float(sound_speed_mps), clock, value, derivative)
+    return value, derivative
 
 
 def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -211,12 +314,9 @@ def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tup
     by_range, by_rate : float64 (n, vehicles, 8)
         Derivatives by ``pose``.
     """
-    n = len(links)
-    range_m, rate = np.empty(n), np.empty(n)
-    by_range, by_rate = np.zeros((n, len(pose), 8)), np.zeros((n, len(pose), 8))
-    ends = (links.emitter_vehicle, links.emitter_point, links.receiver_vehicle, links.receiver_point)
-    _fill(*ends, np.ascontiguousarray(pose), dt, sound_speed_mps, range_m, rate, by_range, by_rate)
-    return range_m, rate, by_range, by_rate
+    n, shape = len(links), (len(links), len(pose), 8)
+    value, derivative = rows_at(links, np.append(pose, np.zeros(2)), dt, sound_speed_mps, False, True)
+    return value[:n], value[n:], derivative[:n, :-2].reshape(shape), derivative[n:, :-2].reshape(shape)
 
 
 def row_times(links: Links, time_s: Floats, range_m: Floats, sound_speed_mps: float) -> Floats:

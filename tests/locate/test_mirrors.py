@@ -117,3 +117,19 @@ def test_a_beacon_hardly_out_of_the_plane_does_not_decide(rng: np.random.Generat
     site = make_site(lifted)
     found = fix(make_epoch(site, Drive(PLACE), rng=rng), site, "v")
     assert found.status == "ambiguous"
+
+
+@pytest.mark.parametrize("rate_sd_mps", [None, 0.05])
+def test_mirrors_beside_each_other_on_a_known_level_are_not_two_heights(rate_sd_mps: float | None) -> None:
+    # 7 mm beside the line of all beacons: the other solution is 14 mm away, on the same level
+    line = np.column_stack([np.linspace(0, 9, 4), np.full(4, 4.0), np.full(4, 2.5)])
+    site = make_site(line, level_m=1.0)
+    place = np.array([3.1, 4.007, 1.0])
+    epoch = make_epoch(site, Drive(place, (0.5, 0.0, 0.0)), sd_m=1e-4, rate_sd_mps=rate_sd_mps)
+    found = fix(epoch, site, "v")
+    assert found.status == "ok"
+    both = sorted([found.position_m.tolist(), found.mirror_m.tolist()])
+    np.testing.assert_allclose(both, [place * [1, 0, 1] + [0, 3.993, 0], place], atol=1e-6)
+    # whichever is told, the deviation reaches to the other
+    assert found.sd("y") > 0.014
+    assert np.linalg.eigvalsh(found.covariance).min() > 0

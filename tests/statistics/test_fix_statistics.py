@@ -14,7 +14,7 @@ from scipy.stats import binom, chi2
 
 from locate.made_epochs import BOUNDS, HALL, SPEED, Drive, ends, heard_range_m, make_epoch, make_site
 from sonofix.locate.fix import fix
-from sonofix.locate.rows import CLOCK_SPEED_SD
+from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Floats, RangeEpoch
 from sonofix.site import Site
 

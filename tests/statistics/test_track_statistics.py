@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from locate.made_epochs import HALL, SPEED, Drive, make_epoch, make_site, rows_of
 from sonofix.geometry import link, model
 from sonofix.locate.fix import fix
-from sonofix.locate.rows import CLOCK_SPEED_SD
+from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, estimate, predict

@@ -12,7 +12,7 @@ from locate.made_epochs import HALL, Drive, make_epoch, make_site
 from sonofix.geometry import POSE
 from sonofix.locate.fix import fix
 from sonofix.records import Floats
-from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, start_at
+from sonofix.track.belief import Belief, Motion, age, blank, estimate, place, predict, start_at
 
 MOTION = Motion(acceleration_psd=0.7, climb_psd=0.03, turn_psd=0.2, clock_psd=3e-6)
 PLACE = (3.0, 5.5, 1.1)
@@ -184,3 +184,32 @@ def test_an_estimates_heading_lies_between_minus_pi_and_pi(rng: np.random.Genera
     mean = belief.mean.copy()
     mean[3] = 7.0
     assert estimate(replace(belief, mean=mean), site, 0, "fused").yaw_rad == pytest.approx(7.0 - 2 * np.pi)
+
+
+# --- the plain twin of the kernel -------------------------------------------------------------------------------------
+
+
+def test_ageing_matches_its_plain_twin(rng: np.random.Generator) -> None:
+    # F P Fᵀ + Q with whole matrices, pair by pair of a place and its rate
+    motion = Motion(0.5, 0.01, 0.3, 1e-6)
+    for dt in (0.4, -0.2, 3.0):
+        n = 26
+        half = rng.standard_normal((n, n))
+        free = rng.random(n) < 0.7
+        placed = np.array([True, False, True])
+        belief = Belief(1.0, rng.standard_normal(n), half @ half.T, free, placed)
+        step, noise = np.eye(n), np.zeros((n, n))
+        pairs = [(8 * v + k, 8 * v + 4 + k, psd) for v in (0, 2) for k, psd in enumerate((0.5, 0.5, 0.01, 0.3))]
+        for at, rate, psd in [*pairs, (24, 25, 1e-6)]:
+            if not free[rate]:
+                continue
+            step[at, rate] = dt
+            noise[rate, rate] = psd * abs(dt)
+            if free[at]:
+                noise[at, at] = psd * abs(dt) ** 3 / 3
+                noise[at, rate] = noise[rate, at] = psd * dt * abs(dt) / 2
+        aged = predict(belief, 1.0 + dt, motion)
+        np.testing.assert_allclose(aged.mean, step @ belief.mean, rtol=1e-13, atol=1e-14)
+        np.testing.assert_allclose(aged.covariance, step @ belief.covariance @ step.T + noise, rtol=1e-11, atol=1e-12)
+        assert aged.time_s == 1.0 + dt
+    assert len(age.signatures) == 1

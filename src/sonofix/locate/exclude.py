@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.locate.rows import Rows
-from sonofix.locate.solve import Solution, solve
+from sonofix.locate.rows import Rows, Solution
 
 FALSE_ALARM = 1e-5
 """Of the χ² test, per epoch."""
@@ -35,60 +33,49 @@ def exclude(
     isolated : bool
         False where different choices mend the test alike but disagree on the position.
     """
-    if agrees(solver, rows, found[0]) or len(rows) <= solver.needed + 1:
+    if agrees(solver, len(rows), found[0].chi2) or len(rows) <= solver.needed + 1:
         return rows, found, True
     for count in (1, 2):
         if len(rows) - count <= solver.needed or (count == 2 and len(rows) * (len(rows) - 1) // 2 > MOST_PAIRS):
             break
-        passing = [(s, fewer) for s, fewer in _without(solver, rows, found[0], count) if agrees(solver, fewer, s)]
+        choices = _leaving(rows, count)
+        place_m, chi2, deviation_m = solver.without(choices, found[0])
+        passing = [i for i in np.argsort(chi2, kind="stable") if agrees(solver, len(rows) - count, float(chi2[i]))]
         if passing:
-            passing.sort(key=lambda trial: trial[0].chi2)
-            best, fewer = passing[0]
-            again = solver.candidates(fewer)
+            best = passing[0]
+            again = solver.candidates(choices[best])
             if again:
-                return fewer, again, not any(_apart(best, other) for other, _ in passing[1:])
+                gap_m = np.linalg.norm(place_m[passing] - place_m[best], axis=1)
+                return choices[best], again, not np.any(gap_m > APART_SIGMA * deviation_m[best])
     return *_one_by_one(solver, rows, found), True
 
 
-def agrees(solver: Rows, rows: NDArray[np.int64], solution: Solution) -> bool:
-    """Whether the misfit of rows is what their deviations allow (true where none is left over to tell)."""
+def agrees(solver: Rows, count: int, chi2: float) -> bool:
+    """Whether the misfit of so many rows is what their deviations allow (true where none is left over to tell)."""
     from scipy.special import chdtri
 
-    dof = solver.count(rows) - solution.jacobian.shape[1]
-    return dof <= 0 or solution.chi2 <= float(chdtri(dof, FALSE_ALARM))
+    dof = solver.degrees(count)
+    return dof <= 0 or chi2 <= float(chdtri(dof, FALSE_ALARM))
 
 
-def _without(
-    solver: Rows, rows: NDArray[np.int64], best: Solution, count: int
-) -> Iterator[tuple[Solution, NDArray[np.int64]]]:
-    """Solve again without each choice of ``count`` rows."""
-    for left_out in combinations(range(len(rows)), count):
-        fewer = np.delete(rows, left_out)
-        try:
-            yield solve(solver.problem(fewer), best.pose, best.clock_m), fewer
-        except np.linalg.LinAlgError:
-            continue
-
-
-def _apart(a: Solution, b: Solution) -> bool:
-    size = np.sqrt(np.sum(a.jacobian**2, axis=0))
-    deviation = float(np.max(1.0 / np.maximum(size, 1e-9)))
-    return bool(np.linalg.norm(a.pose[:3] - b.pose[:3]) > APART_SIGMA * deviation)
+def _leaving(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Rows without each choice of ``count`` of them (choices, n − count)."""
+    left_out = list(combinations(range(len(rows)), count))
+    keep = np.ones((len(left_out), len(rows)), bool)
+    keep[np.arange(len(left_out))[:, None], left_out] = False
+    return np.broadcast_to(rows, keep.shape)[keep].reshape(len(left_out), -1)
 
 
 def _one_by_one(
     solver: Rows, rows: NDArray[np.int64], found: list[Solution]
 ) -> tuple[NDArray[np.int64], list[Solution]]:
-    while len(rows) > solver.needed + 1 and not agrees(solver, rows, found[0]):
-        best = found[0]
-        dof = solver.count(rows) - best.jacobian.shape[1]
-        each = solver.count(rows) // len(rows)
-        trials = list(_without(solver, rows, best, 1))
-        if not trials:
+    while len(rows) > solver.needed + 1 and not agrees(solver, len(rows), found[0].chi2):
+        choices = _leaving(rows, 1)
+        chi2 = solver.without(choices, found[0])[1]
+        best = int(np.argmin(chi2))
+        again = solver.candidates(choices[best])
+        before = found[0].chi2 / solver.degrees(len(rows))
+        if not again or chi2[best] / max(1, solver.degrees(len(rows) - 1)) > 0.5 * before:
             break
-        mended, fewer = min(trials, key=lambda trial: trial[0].chi2)
-        again = solver.candidates(fewer)
-        if not again or mended.chi2 / max(1, dof - each) > 0.5 * best.chi2 / dof:
-            break
-        rows, found = fewer, again
+        rows, found = choices[best], again
     return rows, found

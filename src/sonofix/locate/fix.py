@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE, from_arm, link, open_arms, row_times
+from sonofix.geometry import POSE, from_arm, link, open_arms
 from sonofix.locate.exclude import agrees, exclude
-from sonofix.locate.rows import Rows
-from sonofix.locate.solve import Solution, invert, solve
+from sonofix.locate.rows import Rows, Solution
 from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
@@ -40,54 +39,44 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         ``status`` tells an expected failure, with its remedy; nothing is raised for poor geometry.
     """
     who = [v.id for v in site.vehicles].index(vehicle)
-    links = link(site, epoch.emitter, epoch.receiver)
-    mine = (links.emitter_vehicle == who) & (links.receiver_vehicle < 0)
-    mine |= (links.receiver_vehicle == who) & (links.emitter_vehicle < 0)
-    rows = np.flatnonzero(mine & np.isfinite(epoch.range_m))
-    moments = row_times(links, epoch.time_s, epoch.range_m, epoch.sound_speed_mps)
-    time_s = float(np.mean(moments[rows])) if len(rows) else epoch.sync_s
-    if epoch.clock == "common" and len(rows):
-        # flights are not known, only their differences: the earliest arrival stands in
-        time_s = float(np.mean(epoch.time_s[rows]))
-    level_m = site.vehicle(vehicle).z_m
-    solver = Rows(epoch, links, rows, time_s, level_m)
+    solver = Rows(epoch, link(site, epoch.emitter, epoch.receiver), who, site.vehicles[who].z_m)
+    rows, time_s = solver.rows, solver.time_s
     if len(rows) < solver.needed:
         text = f"{len(rows)} of {solver.needed} ranges; bring more beacons in reach or state what is known (z_m)"
         return _failed(epoch, vehicle, time_s, "too-few", text)
-    found = solver.candidates(rows)
+    everything = np.arange(len(rows))
+    found = solver.candidates(everything)
     if not found:
         return _failed(epoch, vehicle, time_s, "no-convergence", "no position fits; check beacon positions and units")
-    everything = found[0]
-    kept, found, isolated = exclude(solver, rows, found)
+    misfit = found[0].chi2
+    kept, found, isolated = exclude(solver, everything, found)
     best = found[0]
     status: FixStatus = "ok"
     remedy = ""
     inflation = 1.0
-    if not agrees(solver, kept, best):
-        status, inflation = "inconsistent", best.chi2 / (solver.count(kept) - best.jacobian.shape[1])
+    if not agrees(solver, len(kept), best.chi2):
+        status, inflation = "inconsistent", best.chi2 / solver.degrees(len(kept))
         remedy = "ranges disagree and no single one explains it; check beacon positions, sound speed and echoes"
     elif not isolated:
-        status, inflation = "inconsistent", everything.chi2 / (solver.count(rows) - everything.jacobian.shape[1])
+        status, inflation = "inconsistent", misfit / solver.degrees(len(rows))
         remedy = "a range is wrong, but which cannot be told; bring more beacons in reach"
     rivals = [s for s in found[1:] if s.chi2 < best.chi2 + AMBIGUOUS_CHI2 * inflation]
-    best, mirror, undecided = _tell_apart(best, rivals, site, epoch, kept)
+    best, mirror, undecided = _tell_apart(best, rivals, site, epoch, rows[kept])
+    mirror_m = None if mirror is None else mirror.position_m.copy()
     if undecided:
         text = "two positions or headings fit alike; state the room's bounds_m or the vehicle's z_m, or move one beacon"
-        return replace(
-            _failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=None if mirror is None else mirror.pose[:3]
-        )
-    covariance = invert(best.jacobian)
+        return replace(_failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=mirror_m)
+    covariance = solver.covariance(best)
     if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
         text = "the beacons in reach leave a direction open; spread them off one line or plane"
         return _failed(epoch, vehicle, time_s, "no-convergence", text)
-    if mirror is not None and site.bounds_m is None:
-        best, covariance = _between(best, mirror, covariance, solver)
-    states = tuple(np.array(POSE)[solver.free]) + (("clock",) if solver.clock else ())
-    hdop, vdop = solver.dop(kept, best)
+    if mirror is not None and site.bounds_m is None and solver.level_m is None:
+        best, covariance = _between(best, mirror, covariance)
+    states = tuple(POSE[i] for i in solver.components) + ("clock",) * solver.clock
     used = np.zeros(len(epoch), bool)
-    used[kept] = True
+    used[rows[kept]] = True
     residual = np.full(len(epoch), np.nan)
-    residual[rows] = solve(solver.problem(rows), best.pose, best.clock_m, iterations=0).residual_m
+    residual[rows], hdop, vdop = solver.look(kept, best)
     position, covariance = _shift_to_origin(best, covariance * inflation, solver.open_arm + open_arms(site)[who])
     return Fix(
         time_s=time_s,
@@ -96,8 +85,8 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         remedy=remedy,
         states=states,
         position_m=position,
-        velocity_mps=best.pose[4:7].copy() if solver.rates else None,
-        yaw_rad=float(best.pose[3]) if solver.free[3] else None,
+        velocity_mps=best.state[4:7].copy() if solver.rates else None,
+        yaw_rad=float(best.state[3]) if solver.turns else None,
         clock_offset_m=best.clock_m if solver.clock else None,
         covariance=covariance,
         hdop=hdop,
@@ -106,7 +95,7 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         vpl_m=None,
         used=used,
         residual_m=residual,
-        mirror_m=None if mirror is None else mirror.pose[:3],
+        mirror_m=mirror_m,
     )
 
 
@@ -120,42 +109,41 @@ def _tell_apart(
     if not rivals:
         return best, None, False
     if site.bounds_m is None:
-        apart = best.pose[:3] - rivals[0].pose[:3]
+        apart = best.position_m - rivals[0].position_m
         range_m = abs(float(np.median(epoch.range_m[kept])))
         seen_m = max(FLAT_M, float(np.median(np.sqrt(np.diag(epoch.covariance_m2)[kept]))))
         close = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * range_m) < seen_m
         return best, rivals[0], len(rivals) > 1 or not close
     low, high = np.array(site.bounds_m)
-    inside = [s for s in [best, *rivals] if np.all(s.pose[:3] >= low - 0.1) and np.all(s.pose[:3] <= high + 0.1)]
+    inside = [s for s in [best, *rivals] if np.all(s.position_m >= low - 0.1) and np.all(s.position_m <= high + 0.1)]
     if len(inside) != 1:
         return best, rivals[0], True
     others = [s for s in [best, *rivals] if s is not inside[0]]
     return inside[0], others[0], False
 
 
-def _between(best: Solution, mirror: Solution, covariance: Floats, solver: Rows) -> tuple[Solution, Floats]:
+def _between(best: Solution, mirror: Solution, covariance: Floats) -> tuple[Solution, Floats]:
     """Return the middle of two solutions just above each other; half their distance is the height's deviation."""
-    half_m = (best.pose[2] - mirror.pose[2]) / 2
-    pose = best.pose.copy()
-    pose[2] -= half_m
-    height = int(np.sum(solver.free[:2]))
+    half_m = (best.state[2] - mirror.state[2]) / 2
+    state = best.state.copy()
+    state[2] -= half_m
     wider = covariance.copy()
-    wider[height, :] = wider[:, height] = 0.0
-    wider[height, height] = half_m**2 + covariance[height, height]
-    return replace(best, pose=pose), wider
+    wider[2, :] = wider[:, 2] = 0.0
+    wider[2, 2] = half_m**2 + covariance[2, 2]
+    return replace(best, state=state), wider
 
 
 def _too_weak(best: Solution, covariance: Floats, solver: Rows, rows: NDArray[np.int64]) -> bool:
     """Whether the deviation is so large against the ranges that it means nothing."""
-    nearest = float(np.min(np.abs(solver.problem(rows).range_m - best.clock_m)))
-    places = int(np.sum(solver.free[:3]))
-    return float(np.max(np.diag(covariance)[:places])) > (0.5 * max(nearest, 0.2)) ** 2
+    nearest = float(np.abs(solver.range_m[rows] - best.clock_m).min())
+    places = 2 if solver.level_m is not None else 3
+    return float(covariance.diagonal()[:places].max()) > (0.5 * max(nearest, 0.2)) ** 2
 
 
 def _shift_to_origin(best: Solution, covariance: Floats, arm: Floats) -> tuple[Floats, Floats]:
     """Position of the vehicle's origin where a lever arm leaves the heading open: the arm becomes uncertainty."""
-    position, covariance = best.pose[:3].copy(), covariance.copy()
-    shift, sd_m = from_arm(arm, best.pose[4:7])
+    position, covariance = best.position_m.copy(), covariance.copy()
+    shift, sd_m = from_arm(arm, best.state[4:7])
     position[:2] += shift
     covariance[:2, :2] += np.eye(2) * sd_m**2
     return position, covariance

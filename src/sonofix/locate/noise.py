@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,23 +15,65 @@ MANOEUVRE_MPS2 = 2.0
 TYPICAL_SPEED_MPS = 1.5
 """What a misplaced beacon's direction is taken to matter at."""
 
+CLOCK_SPEED_SD = 1e-4
+"""Deviation of a free clock's speed from the recorder's: two cheap crystals."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fill_noise(range_m, covariance_m2, rate_sd_mps, misplaced_m, emitter, rows, dt, speed_sd_mps, clock_sd_mps, out):
+    """Fill ``out`` (m, m) as `row_noise` describes it.
+
+    Of all rows of an epoch: ``range_m``, their covariance, ``rate_sd_mps`` (empty without rates: m = n), their
+    emitters' ``misplaced_m``, and ``emitter``: a number each. Of the n rows asked for: ``rows`` and ``dt``.
+    """
+    n = len(rows)
+    out[:] = 0.0
+    for i in range(n):
+        a = rows[i]
+        for k in range(n):
+            b = rows[k]
+            out[i, k] = covariance_m2[a, b]
+            # a beacon's misplacement is the same for all who hear it
+            if emitter[a] == emitter[b]:
+                out[i, k] += misplaced_m[a] ** 2
+        out[i, i] += (MANOEUVRE_MPS2 * dt[i] ** 2 / 2) ** 2 + (speed_sd_mps * dt[i]) ** 2
+    if len(out) == n:
+        return
+    for i in range(n):
+        a = rows[i]
+        # a clock of its own runs at its own speed, which all range rates share
+        for k in range(n):
+            out[n + i, n + k] = clock_sd_mps**2
+        # a misplaced beacon is seen in another direction, so that its range rate is another part of the velocity
+        turned = TYPICAL_SPEED_MPS * misplaced_m[a] / max(abs(range_m[a]), 1.0)
+        out[n + i, n + i] += rate_sd_mps[a] ** 2 + (MANOEUVRE_MPS2 * dt[i]) ** 2 + turned**2
+
 
 def row_noise(
-    epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats, speed_sd_mps: float = 0.0
-) -> tuple[Floats, Floats | None]:
-    """Covariances (n, n) of ranges in m² and of range rates in m²/s², where there are any.
+    epoch: RangeEpoch,
+    links: Links,
+    rows: NDArray[np.int64],
+    dt: Floats,
+    speed_sd_mps: float = 0.0,
+    clock_sd_mps: float = 0.0,
+) -> Floats:
+    """Covariance (m, m) of some rows' ranges in m² and, below, of their range rates in m²/s², where there are any.
 
-    ``dt`` (n,) is when each row was heard from the instant the motion state belongs to; ``speed_sd_mps`` the deviation
-    of a velocity that is taken as 0.
+    Parameters
+    ----------
+    dt : float64 (n,)
+        When each row was heard, from the instant the motion state belongs to.
+    speed_sd_mps : float
+        Deviation of a velocity that is taken as 0.
+    clock_sd_mps : float
+        Deviation of a clock's drift that is taken as 0.
     """
-    covariance = epoch.covariance_m2[np.ix_(rows, rows)] + np.diag(
-        (MANOEUVRE_MPS2 * dt**2 / 2) ** 2 + (speed_sd_mps * dt) ** 2
-    )
-    emitters = np.array([epoch.emitter[i] for i in rows])
-    # a beacon's misplacement is the same for all who hear it
-    covariance += np.where(emitters[:, None] == emitters, links.emitter_sd_m[rows] ** 2, 0.0)
-    if epoch.range_rate_sd_mps is None:
-        return covariance, None
-    # a misplaced beacon is seen in another direction, so that its range rate is another part of the velocity
-    turned = TYPICAL_SPEED_MPS * links.emitter_sd_m[rows] / np.maximum(np.abs(epoch.range_m[rows]), 1.0)
-    return covariance, np.diag(epoch.range_rate_sd_mps[rows] ** 2 + (MANOEUVRE_MPS2 * dt) ** 2 + turned**2)
+    if links.emitter_sd_m.any():
+        emitter = np.unique(np.array(epoch.emitter), return_inverse=True)[1]
+    else:
+        emitter = np.zeros(len(epoch), np.int64)
+    rate_sd = np.zeros(0) if epoch.range_rate_sd_mps is None else epoch.range_rate_sd_mps
+    out = np.empty((2 * len(rows),) * 2 if len(rate_sd) else (len(rows),) * 2)
+    own = (epoch.range_m, np.ascontiguousarray(epoch.covariance_m2), rate_sd, links.emitter_sd_m, emitter)
+    fill_noise(*own, rows, dt, speed_sd_mps, clock_sd_mps, out)
+    return out

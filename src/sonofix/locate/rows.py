@@ -2,174 +2,219 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links
-from sonofix.locate.noise import row_noise
-from sonofix.locate.solve import Problem, Solution, chi2, invert, solve
-from sonofix.locate.start import starts
+from sonofix.geometry import SAME_ARM_M, Links, expected
+from sonofix.locate.dense import spread
+from sonofix.locate.noise import CLOCK_SPEED_SD, row_noise
+from sonofix.locate.search import MOST, search, without
 from sonofix.records import Floats, RangeEpoch
 
 UNKNOWN_SPEED_MPS = 1.0
 """Deviation of the velocity (from 0) where no range rates tell of it: a walk."""
 
-CLOCK_SPEED_SD = 1e-4
-"""Deviation of a free clock's speed from the recorder's: two cheap crystals."""
 
-YAW_STARTS = 12
-"""Headings looked at from each starting place."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Where a descent came to rest: state (10,) as `solve.misfit` has it, whitened χ² and Jacobian (m, k)."""
+
+    state: Floats
+    chi2: float
+    jacobian: Floats
+
+    @property
+    def position_m(self) -> Floats:
+        """Where the motion is followed (3,)."""
+        return self.state[:3]
+
+    @property
+    def clock_m(self) -> float:
+        """Offset that all ranges share."""
+        return float(self.state[8])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def gather(ends, who, time_s, range_m, common, c):
+    """Pick one vehicle's rows whose other end is fixed, as of a site where it is the only one.
+
+    Returns
+    -------
+    rows : int64 (n,)
+    middle_s : float
+        Mean of the moments that they speak of: when heard, or when sent where only the emitter moves. With an unknown
+        clock flights are not known, only their differences: the earliest arrival stands in.
+    dt : float64 (n,)
+        When each was heard, from then.
+    ends : tuple
+        Of these rows; lever arms less ``open_arm``.
+    open_arm : float64 (2,)
+        Two ends on one body fix the heading; a lone one off the axis leaves its origin open by its arm.
+    turns : bool
+    """
+    emitter_vehicle, emitter_point, receiver_vehicle, receiver_point = ends
+    count, middle_s = 0, 0.0
+    mine = np.zeros(len(range_m), np.bool_)
+    for i in range(len(range_m)):
+        sounding = emitter_vehicle[i] == who and receiver_vehicle[i] < 0
+        listening = receiver_vehicle[i] == who and emitter_vehicle[i] < 0
+        mine[i] = (sounding or listening) and np.isfinite(range_m[i])
+        if mine[i]:
+            count += 1
+            middle_s += time_s[i] - (range_m[i] / c if sounding and not common else 0.0)
+    middle_s /= max(count, 1)
+    rows, dt, open_arm, turns = np.empty(count, np.int64), np.empty(count), np.zeros(2), False
+    sent, sent_at = np.empty(count, np.int64), np.empty((count, 3))
+    heard, heard_at = np.empty(count, np.int64), np.empty((count, 3))
+    first_x = first_y = 0.0
+    k = 0
+    for i in range(len(range_m)):
+        if not mine[i]:
+            continue
+        rows[k], dt[k] = i, time_s[i] - middle_s
+        sent[k], heard[k] = min(emitter_vehicle[i], 0), min(receiver_vehicle[i], 0)
+        for axis in range(3):
+            sent_at[k, axis], heard_at[k, axis] = emitter_point[i, axis], receiver_point[i, axis]
+        arm = heard_at[k] if heard[k] == 0 else sent_at[k]
+        if k == 0:
+            first_x, first_y = arm[0], arm[1]
+        turns |= (arm[0] - first_x) ** 2 + (arm[1] - first_y) ** 2 > SAME_ARM_M**2
+        open_arm[0] += arm[0] / count
+        open_arm[1] += arm[1] / count
+        k += 1
+    if turns:
+        open_arm[:] = 0.0
+    for k in range(count):
+        arm = heard_at[k] if heard[k] == 0 else sent_at[k]
+        arm[0] -= open_arm[0]
+        arm[1] -= open_arm[1]
+    return rows, middle_s, dt, (sent, sent_at, heard, heard_at), open_arm, turns
+
+
+@numba.njit(cache=True, error_model="numpy")
+def look(rows, c, clock, index, state, kept, residual):
+    """Fill ``residual`` (n,) of all ranges at a state; return horizontal and vertical DOP of those kept.
+
+    Dilution is of ranges alone, with unit variances; the horizontal one is negative where a direction is left open,
+    the vertical one 0 where the level is known.
+    """
+    ends, dt, measured = rows
+    n, places, in_space = len(dt), 0, False
+    value, derivative = np.empty(n), np.empty((n, 10))
+    expected(ends, state, dt, c, clock, value, derivative)
+    for i in range(n):
+        residual[i] = measured[i] - value[i]
+    chosen = np.empty(len(index), np.int64)
+    for j in index:
+        if j < 4 or j == 8:
+            chosen[places] = j
+            places += 1
+            in_space |= j == 2
+    unit, covariance = np.empty((len(kept), places)), np.empty((places, places))
+    for i in range(len(kept)):
+        for j in range(places):
+            unit[i, j] = derivative[kept[i], chosen[j]]
+    if not spread(unit, covariance):
+        return -1.0, 0.0
+    return np.sqrt(covariance[0, 0] + covariance[1, 1]), np.sqrt(covariance[2, 2]) if in_space else 0.0
 
 
 class Rows:
-    """Rows of one vehicle in one epoch: what is unknown, and what each selection of rows says of it.
+    """Rows of one vehicle in one epoch: what is unknown, and what each selection of them says of it.
+
+    Selections count these rows, not those of the epoch: ``rows`` (n,) are theirs there.
 
     Parameters
     ----------
     epoch : RangeEpoch
     links : Links
         Of all rows of the epoch.
-    rows : int (n,)
-        Those of this vehicle.
-    time_s : float
-        The instant to solve for.
+    who : int
+        The vehicle's index in the site.
     level_m : float or None
         The vehicle's level, where known.
     """
 
-    def __init__(
-        self, epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], time_s: float, level_m: float | None
-    ) -> None:
-        self.epoch, self.links, self.level_m = epoch, links, level_m
-        self.dt = epoch.time_s - time_s
-        self.clock = epoch.clock == "common"
-        self.rates = epoch.range_rate_mps is not None
-        mounted = links.receiver_vehicle[rows] >= 0
-        arms = np.where(mounted[:, None], links.receiver_point[rows], links.emitter_point[rows])
-        flat = arms[:, :2] - arms[:1, :2]
-        self.arm = arms.mean(axis=0) if len(rows) else np.zeros(3)
-        turns = bool(len(rows)) and bool(np.any(np.hypot(flat[:, 0], flat[:, 1]) > 1e-3))
-        self.free = np.array([True, True, level_m is None, turns] + [False] * 4)
-        if self.rates:
-            self.free[4:] = [True, True, level_m is None, turns]
-        # two ends on one body fix the heading; a lone one off the axis leaves its origin open by its arm
-        self.open_arm = np.zeros(2) if turns else self.arm[:2]
-        self.needed = int(self.free[:4].sum()) + self.clock
-        here = links
-        self.as_first = Links(
-            np.where(here.emitter_vehicle >= 0, 0, -1),
-            here.emitter_point - self._unseen(here.emitter_vehicle),
-            np.where(here.receiver_vehicle >= 0, 0, -1),
-            here.receiver_point - self._unseen(here.receiver_vehicle),
-            here.emitter_sd_m,
+    def __init__(self, epoch: RangeEpoch, links: Links, who: int, level_m: float | None) -> None:
+        self.clock, self.rates = epoch.clock == "common", epoch.range_rate_mps is not None
+        self.level_m = level_m
+        self._speed_mps = float(epoch.sound_speed_mps)
+        self.rows, middle_s, self._dt, self._ends, self.open_arm, self.turns = gather(
+            links.ends, who, epoch.time_s, epoch.range_m, self.clock, self._speed_mps
         )
+        self.time_s = middle_s if len(self.rows) else epoch.sync_s
+        places = [0, 1] + [2] * (level_m is None) + [3] * self.turns
+        self.needed = len(places) + self.clock
+        self._index = np.array(places + [4 + p for p in places if self.rates] + [8] * self.clock)
+        self.range_m = self._measured = epoch.range_m[self.rows]
+        if epoch.range_rate_mps is not None:
+            self._measured = np.concatenate([self.range_m, epoch.range_rate_mps[self.rows]])
+        speed_sd, clock_sd = 0.0 if self.rates else UNKNOWN_SPEED_MPS, CLOCK_SPEED_SD * self._speed_mps * self.clock
+        self._covariance = row_noise(epoch, links, self.rows, self._dt, speed_sd, clock_sd)
 
-    def _unseen(self, vehicle: NDArray[np.int64]) -> Floats:
-        """Part of mounted lever arms that no heading places: solved for at the arm's own point."""
-        arm = np.append(self.open_arm, 0.0)
-        return np.where((vehicle >= 0)[:, None], arm, 0.0)
+    @property
+    def components(self) -> tuple[int, ...]:
+        """Which components of `geometry.POSE` are solved for."""
+        return tuple(int(j) for j in self._index if j < 8)
 
-    def count(self, rows: NDArray[np.int64]) -> int:
-        """Number of measurements in a selection: ranges, and range rates where there are any."""
-        return len(rows) * (2 if self.rates else 1)
-
-    def problem(self, rows: NDArray[np.int64]) -> Problem:
-        """Return what is to be solved for a selection of rows."""
-        epoch, dt = self.epoch, self.dt[rows]
-        covariance, rates = row_noise(epoch, self.links, rows, dt, 0.0 if self.rates else UNKNOWN_SPEED_MPS)
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-        rate = None
-        if epoch.range_rate_mps is not None and rates is not None:
-            rate = epoch.range_rate_mps[rows]
-            if self.clock:
-                # a clock of its own runs at its own speed, which all range rates share
-                rates = rates + (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
-            n = len(rows)
-            both = np.zeros((2 * n, 2 * n))
-            both[:n, :n] = whiten
-            both[n:, n:] = np.linalg.inv(np.linalg.cholesky(rates))
-            whiten = both
-        return Problem(
-            self.as_first.rows(rows),
-            epoch.range_m[rows],
-            rate,
-            dt,
-            whiten,
-            self.free,
-            self.clock,
-            epoch.sound_speed_mps,
-        )
+    def degrees(self, count: int) -> int:
+        """Degrees of freedom of so many rows: measurements (ranges, and rates where there are any) less unknowns."""
+        return count * (2 if self.rates else 1) - len(self._index)
 
     def candidates(self, rows: NDArray[np.int64]) -> list[Solution]:
-        """Solutions from all starts, best first, none twice."""
-        links = self.as_first.rows(rows)
-        fixed_ends = np.where((links.emitter_vehicle < 0)[:, None], links.emitter_point, links.receiver_point)
-        arms = np.where((links.emitter_vehicle < 0)[:, None], links.receiver_point, links.emitter_point)
-        anchors = fixed_ends - arms * np.array([0.0, 0.0, 1.0])
-        problem = self.problem(rows)
-        found: list[Solution] = []
+        """Solutions from all starts, best first, none twice.
 
-        def descend(begin: Floats) -> None:
-            for yaw in self._yaws(problem, begin):
-                pose = np.zeros(8)
-                pose[:3], pose[3] = begin[:3], yaw
-                try:
-                    solution = solve(problem, pose, float(begin[3]))
-                except np.linalg.LinAlgError:
-                    continue
-                if solution.converged:
-                    found.append(solution)
+        Raises
+        ------
+        LinAlgError
+            If the covariance of rows is not positive.
+        """
+        ends, dt, measured, covariance = self._ends, self._dt, self._measured, self._covariance
+        if len(rows) < len(dt):
+            both = np.concatenate([rows, rows + len(dt)]) if self.rates else rows
+            ends, dt = tuple(part[rows] for part in ends), dt[rows]
+            measured, covariance = measured[both], np.ascontiguousarray(covariance[both[:, None], both])
+        m, flat = len(measured), self.level_m is not None
+        states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, m, len(self._index)))
+        at = (
+            (ends, dt, measured),
+            self._speed_mps,
+            self.clock,
+            covariance,
+            self._index,
+            flat,
+            float(self.level_m or 0),
+        )
+        count = search(*at, states, chi2s, jacobians)
+        if count < 0:
+            raise np.linalg.LinAlgError("covariance_m2 is not positive definite; give every range a deviation above 0")
+        return [Solution(states[i], float(chi2s[i]), jacobians[i]) for i in range(count)]
 
-        for begin in starts(anchors, problem.range_m, self.level_m, self.clock):
-            descend(begin)
-        # anchors nearly in one plane have nearly a mirror solution, which the linear start may have missed, or hit
-        if found and self.free[3]:
-            best = min(found, key=lambda s: s.chi2)
-            descend(np.append(_mirrored(best.pose[:3], anchors, self.level_m is None), best.clock_m))
-        out: list[Solution] = []
-        for solution in sorted(found, key=lambda s: s.chi2):
-            if not any(_alike(solution.pose, other.pose) for other in out):
-                out.append(solution)
-        return out
+    def without(self, choices: NDArray[np.int64], found: Solution) -> tuple[Floats, Floats, Floats]:
+        """Solve again from a solution with each choice (q, p) of rows alone.
 
-    def _yaws(self, problem: Problem, begin: Floats) -> Floats:
-        """Headings worth starting from at a place: the best of a round, and its best rival half a turn or so away."""
-        if not self.free[3]:
-            return np.zeros(1)
-        round_ = np.arange(YAW_STARTS) * (2 * np.pi / YAW_STARTS)
-        poses = np.zeros((YAW_STARTS, 8))
-        poses[:, :3], poses[:, 3] = begin[:3], round_
-        misfit = np.array([chi2(problem, pose, float(begin[3])) for pose in poses])
-        best = int(np.argmin(misfit))
-        far = np.abs(np.angle(np.exp(1j * (round_ - round_[best])))) > 1.0
-        rival = int(np.argmin(np.where(far, misfit, np.inf)))
-        return round_[[best, rival]]
+        Returns
+        -------
+        position_m, chi2, deviation_m : float64 (q, 3), (q,), (q,)
+            The deviation is the largest of any unknown, the others taken as known.
+        """
+        states, chi2s, deviations = np.empty((len(choices), 10)), np.empty(len(choices)), np.empty(len(choices))
+        rows = (self._ends, self._dt, self._measured)
+        at = (self._speed_mps, self.clock, self._covariance, self._index)
+        without(rows, *at, choices, found.state, states, chi2s, deviations)
+        return states[:, :3], chi2s, deviations
 
-    def dop(self, rows: NDArray[np.int64], solution: Solution) -> tuple[float | None, float | None]:
-        """Horizontal and vertical dilution of precision: of ranges alone, unit variances."""
-        problem = self.problem(rows)
-        free = self.free.copy()
-        free[4:] = False
-        plain = replace(problem, rate_mps=None, whiten=np.eye(len(rows)), free=free)
-        covariance = invert(solve(plain, solution.pose, solution.clock_m, iterations=1).jacobian)
-        if covariance is None:
-            return None, None
-        vertical = float(np.sqrt(covariance[2, 2])) if free[2] else None
-        return float(np.sqrt(covariance[0, 0] + covariance[1, 1])), vertical
+    def look(self, kept: NDArray[np.int64], found: Solution) -> tuple[Floats, float | None, float | None]:
+        """Residuals (n,) of all rows at a solution, and horizontal and vertical DOP of those kept."""
+        residual_m = np.empty(len(self._dt))
+        rows = (self._ends, self._dt, self._measured)
+        hdop, vdop = look(rows, self._speed_mps, self.clock, self._index, found.state, kept, residual_m)
+        return residual_m, None if hdop < 0 else hdop, None if hdop < 0 or self.level_m is not None else vdop
 
-
-def _mirrored(position: Floats, anchors: Floats, in_space: bool) -> Floats:
-    """Mirror image of a place in the plane (on a level: the line) that anchors are nearest to."""
-    dims = 3 if in_space else 2
-    centre = anchors[:, :dims].mean(axis=0)
-    _, _, axes = np.linalg.svd(anchors[:, :dims] - centre)
-    image = position.copy()
-    image[:dims] -= 2 * ((position[:dims] - centre) @ axes[-1]) * axes[-1]
-    return image
-
-
-def _alike(a: Floats, b: Floats) -> bool:
-    """Whether two poses are one: within 1 cm and 1°."""
-    return bool(np.linalg.norm(a[:3] - b[:3]) < 0.01 and abs(np.angle(np.exp(1j * (a[3] - b[3])))) < 0.02)
+    def covariance(self, found: Solution) -> Floats | None:
+        """Covariance (k, k) of what is solved for; None where it leaves a direction open."""
+        out = np.empty((len(self._index),) * 2)
+        return out if spread(found.jacobian, out) else None

@@ -2,114 +2,129 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
+import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from sonofix.geometry import Links, model
-from sonofix.records import Floats
+from sonofix.geometry import expected
+from sonofix.locate.dense import factor
+
+SAME = 1e-3
+"""A descent that comes within so many metres and radians of where an earlier one came to rest ends there."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """What is to be solved: rows of one vehicle (index 0 of ``links``) and which components are unknown.
+@numba.njit(cache=True, error_model="numpy")
+def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
+    """Fill misfit and Jacobian at a state; return χ².
 
-    ``free`` (8,) marks the components of `geometry.POSE` solved for; ``clock`` whether all ranges share an offset.
-    ``dt`` (n,) is when each row was heard from the reference instant; ``whiten`` (m, m) turns the stacked misfit of
-    ranges and, where ``rate_mps`` is given, rates into unit noise.
+    Parameters
+    ----------
+    rows : tuple
+        ``ends`` as `geometry.expected` takes them, ``dt`` (n,), and what was measured (m,): ranges, then rates if any.
+    whiten : float64 (m, m)
+        Lower triangular.
+    index : int64 (k,)
+        Which of ``state`` are unknown.
+    state : float64 (10,)
+        One vehicle's pose, then clock offset and drift.
+    plain, miss : float64 (m,), out
+        Measured less expected, and the same whitened.
+    jacobian : float64 (m, k), out
+        Whitened derivative of what is expected.
     """
-
-    links: Links
-    range_m: Floats
-    rate_mps: Floats | None
-    dt: Floats
-    whiten: Floats
-    free: NDArray[np.bool_]
-    clock: bool
-    sound_speed_mps: float
-
-    @property
-    def unknowns(self) -> int:
-        """Number of quantities solved for."""
-        return int(self.free.sum()) + self.clock
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """Where Gauss–Newton came to rest: ``pose`` (8,), clock in m, whitened χ² and Jacobian, plain range residuals."""
-
-    pose: Floats
-    clock_m: float
-    chi2: float
-    jacobian: Floats
-    residual_m: Floats
-    converged: bool
+    ends, dt, measured = rows
+    m = len(measured)
+    derivative = np.empty((m, 10))
+    expected(ends, state, dt, c, clock, plain, derivative)
+    chi2 = 0.0
+    for i in range(m):
+        plain[i] = measured[i] - plain[i]
+        miss[i] = 0.0
+        for j in range(len(index)):
+            jacobian[i, j] = 0.0
+        for k in range(i + 1):
+            w = whiten[i, k]
+            if w != 0.0:
+                miss[i] += w * plain[k]
+                for j in range(len(index)):
+                    jacobian[i, j] += w * derivative[k, index[j]]
+        chi2 += miss[i] ** 2
+    return chi2
 
 
-def _misfit(problem: Problem, pose: Floats, clock_m: float) -> tuple[Floats, Floats, Floats]:
-    range_m, rate, by_range, by_rate = model(problem.links, pose[None], problem.dt, problem.sound_speed_mps)
-    miss = problem.range_m - range_m - clock_m
-    derivative = by_range[:, 0][:, problem.free]
-    if problem.clock:
-        derivative = np.hstack([derivative, np.ones((len(miss), 1))])
-    stacked = miss
-    if problem.rate_mps is not None:
-        rates = by_rate[:, 0][:, problem.free]
-        if problem.clock:
-            rates = np.hstack([rates, np.zeros((len(miss), 1))])
-        stacked = np.concatenate([miss, problem.rate_mps - rate])
-        derivative = np.vstack([derivative, rates])
-    return problem.whiten @ stacked, problem.whiten @ derivative, miss
+@numba.njit(cache=True, error_model="numpy")
+def alike(a, b, place_m, yaw_rad):
+    """Whether two states are one within so much."""
+    square = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+    turn = a[3] - b[3]
+    turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
+    return square < place_m**2 and abs(turn) < yaw_rad
 
 
-def solve(problem: Problem, pose: Floats, clock_m: float, iterations: int = 50) -> Solution:
-    """Descend from a start until the step is far below the deviation of what is solved for."""
-    miss, jacobian, residual = _misfit(problem, pose, clock_m)
-    chi2 = float(miss @ miss)
-    damping, converged, gained = 1e-6, False, np.inf
+@numba.njit(cache=True, error_model="numpy")
+def descend(rows, c, clock, whiten, index, known, iterations, state, plain, miss, jacobian):
+    """Descend from ``state``, in place, until the step is far below the deviation of what is solved for.
+
+    Arguments as of `misfit`; ``known`` (q, 10) are states found earlier. Returns χ² and whether it came to rest, and
+    not where one is known.
+    """
+    m, count = len(miss), len(index)
+    chi2 = misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian)
+    new_plain, new_miss, new_jacobian = np.empty(m), np.empty(m), np.empty((m, count))
+    normal, step, size = np.empty((count, count)), np.empty(count), np.empty(count)
+    tried = np.empty(10)
+    damping, gained, new_chi2 = 1e-6, np.inf, np.inf
     for _ in range(iterations):
-        size = np.sqrt(np.sum(jacobian**2, axis=0)) + 1e-300
-        scaled = jacobian / size
-        normal = scaled.T @ scaled
-        step = np.linalg.solve(normal + damping * np.eye(len(normal)), scaled.T @ miss) / size
-        tried, tried_clock = pose.copy(), clock_m
-        tried[problem.free] += step[: int(problem.free.sum())]
-        if problem.clock:
-            tried_clock += float(step[-1])
-        new_miss, new_jacobian, new_residual = _misfit(problem, tried, tried_clock)
-        new_chi2 = float(new_miss @ new_miss)
-        if new_chi2 > chi2 * (1 + 1e-9) + 1e-12:
+        for k in range(len(known)):
+            if alike(state, known[k], SAME, SAME):
+                return chi2, False
+        size[:] = 0.0
+        step[:] = 0.0
+        normal[:] = 0.0
+        for i in range(m):
+            for j in range(count):
+                step[j] += jacobian[i, j] * miss[i]
+                for k in range(j + 1):
+                    normal[j, k] += jacobian[i, j] * jacobian[i, k]
+        for j in range(count):
+            size[j] = np.sqrt(normal[j, j]) + 1e-300
+        for j in range(count):
+            step[j] /= size[j]
+            for k in range(j + 1):
+                normal[j, k] = normal[j, k] / size[j] / size[k]
+            normal[j, j] += damping
+        downhill = factor(normal)
+        if downhill:
+            for j in range(count):
+                for k in range(j):
+                    step[j] -= normal[j, k] * step[k]
+                step[j] /= normal[j, j]
+            for j in range(count - 1, -1, -1):
+                for k in range(j + 1, count):
+                    step[j] -= normal[k, j] * step[k]
+                step[j] /= normal[j, j]
+            for j in range(10):
+                tried[j] = state[j]
+            for j in range(count):
+                tried[index[j]] += step[j] / size[j]
+            new_chi2 = misfit(rows, c, clock, whiten, index, tried, new_plain, new_miss, new_jacobian)
+            downhill = not new_chi2 > chi2 * (1 + 1e-9) + 1e-12
+        if not downhill:
             damping = 10 * max(damping, 1e-4)
             if damping > 1e8:
                 break
             continue
-        small = float(np.max(np.abs(step) * size)) < 1e-4
-        pose, clock_m = tried, tried_clock
-        miss, jacobian, residual = new_miss, new_jacobian, new_residual
         gained = chi2 - new_chi2
         chi2, damping = new_chi2, damping / 10
-        if small:
-            converged = True
-            break
+        for j in range(10):
+            state[j] = tried[j]
+        for i in range(m):
+            plain[i], miss[i] = new_plain[i], new_miss[i]
+            for j in range(count):
+                jacobian[i, j] = new_jacobian[i, j]
+        longest = 0.0
+        for j in range(count):
+            longest = max(longest, abs(step[j]))
+        if longest < 1e-4:
+            return chi2, True
     # beside a beacon the range has a kink: steps zigzag over it long after nothing is gained any more
-    return Solution(pose, clock_m, chi2, jacobian, residual, converged or gained < 1e-3)
-
-
-def chi2(problem: Problem, pose: Floats, clock_m: float) -> float:
-    """Whitened misfit of ranges alone at a pose."""
-    n = len(problem.range_m)
-    plain = replace(problem, rate_mps=None, whiten=problem.whiten[:n, :n])
-    miss = _misfit(plain, pose, clock_m)[0]
-    return float(miss @ miss)
-
-
-def invert(jacobian: Floats) -> Floats | None:
-    """Covariance of a whitened Jacobian, None where it leaves a direction open."""
-    size = np.sqrt(np.sum(jacobian**2, axis=0)) + 1e-300
-    q, r = np.linalg.qr(jacobian / size)
-    del q
-    if len(r) < jacobian.shape[1] or np.min(np.abs(np.diag(r))) < 1e-5:
-        return None
-    half = np.linalg.solve(r, np.eye(len(r)))
-    return half @ half.T / np.outer(size, size)
+    return chi2, gained < 1e-3

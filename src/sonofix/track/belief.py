@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import POSE, from_arm, open_arms
-from sonofix.locate.rows import CLOCK_SPEED_SD
+from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
 
@@ -16,6 +17,9 @@ SIZE = len(POSE)
 
 SOUND_SPEED_MPS = 343.0
 """Near enough to turn a clock's speed into m/s."""
+
+INSTANT_S = 1e-9
+"""Instants that differ by less are one: nothing moves meanwhile."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,52 +73,45 @@ def blank(site: Site) -> Belief:
     return Belief(0.0, mean, np.zeros((n, n)), np.zeros(n, bool), np.zeros(len(site.vehicles), bool))
 
 
+@numba.njit(cache=True, error_model="numpy")
+def age(mean, covariance, free, placed, densities, dt):
+    """Move a belief's ``mean`` and ``covariance`` by ``dt``, in place.
+
+    ``densities`` (4,) are those of `Motion`: along a horizontal axis, upwards, of turns, and of the clock's drift.
+    The noise of an integrated pair is that of white acceleration (Bar-Shalom 2001, eq 6.2.2-12).
+    """
+    n, span = len(mean), abs(dt)
+    for pair in range(4 * len(placed) + 1):
+        vehicle, part = pair // 4, pair % 4
+        at, rate = SIZE * vehicle + part, SIZE * vehicle + 4 + part
+        density = densities[max(part - 1, 0)]
+        if pair == 4 * len(placed):
+            at, rate, density = n - 2, n - 1, densities[3]
+        elif not placed[vehicle]:
+            continue
+        if not free[rate]:
+            continue
+        mean[at] += dt * mean[rate]
+        for k in range(n):
+            covariance[at, k] += dt * covariance[rate, k]
+        for k in range(n):
+            covariance[k, at] += dt * covariance[k, rate]
+        covariance[rate, rate] += density * span
+        if free[at]:
+            covariance[at, at] += density * span**3 / 3
+            covariance[at, rate] += density * dt * span / 2
+            covariance[rate, at] += density * dt * span / 2
+
+
 def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     """Age a belief: positions move with their velocities, uncertainty grows with the white acceleration's integral."""
     dt = time_s - belief.time_s
-    if dt == 0.0 or not belief.placed.any():
+    if abs(dt) < INSTANT_S or not belief.placed.any():
         return replace(belief, time_s=time_s)
-    n = len(belief.mean)
-    transition = np.eye(n)
-    noise = np.zeros((n, n))
-    age = abs(dt)
-    for i in np.flatnonzero(belief.placed):
-        at = SIZE * int(i)
-        for place, speed, psd in (
-            (at, at + 4, motion.acceleration_psd),
-            (at + 1, at + 5, motion.acceleration_psd),
-            (at + 2, at + 6, motion.climb_psd),
-            (at + 3, at + 7, motion.turn_psd),
-        ):
-            _integrate(transition, noise, place, speed, psd, dt, age, belief.free)
-    _integrate(transition, noise, n - 2, n - 1, motion.clock_psd, dt, age, belief.free)
-    return replace(
-        belief,
-        time_s=time_s,
-        mean=transition @ belief.mean,
-        covariance=transition @ belief.covariance @ transition.T + noise,
-    )
-
-
-def _integrate(
-    transition: Floats,
-    noise: Floats,
-    place: int,
-    speed: int,
-    psd: float,
-    dt: float,
-    age: float,
-    free: NDArray[np.bool_],
-) -> None:
-    """Fill the block of one integrated pair; the noise is that of white acceleration (Bar-Shalom 2001, eq 6.2.2-12)."""
-    if not free[speed]:
-        return
-    transition[place, speed] = dt
-    noise[speed, speed] += psd * age
-    if free[place]:
-        noise[place, place] += psd * age**3 / 3
-        noise[place, speed] += psd * dt * age / 2
-        noise[speed, place] += psd * dt * age / 2
+    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd])
+    age(mean, covariance, belief.free, belief.placed, densities, float(dt))
+    return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
 
 
 def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
@@ -179,25 +176,29 @@ def start_at(
 
 def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estimate:
     """Return what is believed of one vehicle."""
-    at = SIZE * vehicle
-    own = [at + i for i in range(SIZE) if belief.free[at + i] and POSE[i] != "yaw_rate"]
+    at, n = SIZE * vehicle, len(belief.mean)
+    free = belief.free.tolist()
+    own = [at + i for i, name in enumerate(POSE) if free[at + i] and name != "yaw_rate"]
     names = [POSE[i - at] for i in own]
-    n = len(belief.mean)
-    if belief.free[n - 2]:
+    if free[n - 2]:
         own.append(n - 2)
         names.append("clock")
-    pose = belief.mean[at : at + SIZE]
-    covariance = belief.covariance[np.ix_(own, own)].copy()
+    pose, index = belief.mean[at : at + SIZE], np.array(own, np.int64)
+    covariance = belief.covariance[index[:, None], index]
     shift, sd_m = from_arm(open_arms(site)[vehicle], pose[4:7])
-    covariance[:2, :2] += np.eye(2) * sd_m**2
+    position = pose[:3].copy()
+    position[:2] += shift
+    if sd_m:
+        covariance[0, 0] += sd_m**2
+        covariance[1, 1] += sd_m**2
     return Estimate(
         time_s=belief.time_s,
         vehicle=site.vehicles[vehicle].id,
         states=tuple(names),
-        position_m=pose[:3] + np.append(shift, 0.0),
+        position_m=position,
         velocity_mps=pose[4:7].copy(),
-        yaw_rad=float(np.angle(np.exp(1j * pose[3]))) if belief.free[at + 3] else None,
-        clock_offset_m=float(belief.mean[n - 2]) if belief.free[n - 2] else None,
+        yaw_rad=float(np.angle(np.exp(1j * pose[3]))) if free[at + 3] else None,
+        clock_offset_m=float(belief.mean[n - 2]) if free[n - 2] else None,
         covariance=covariance,
         source=source,
     )

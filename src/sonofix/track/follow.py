@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, link, open_arms, row_times, turning
+from sonofix.geometry import Links, link, open_arms, row_times, rows_at, turning
 from sonofix.locate.fix import fix
-from sonofix.locate.rows import CLOCK_SPEED_SD
+from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, start_at
@@ -161,12 +161,13 @@ class Follower:
         position = found.position_m
         if not self.belief.placed[who] or found.status != "ok" or position is None or found.covariance is None:
             return False
-        if np.sum(found.used) <= len([s for s in found.states if s in ("x", "y", "z", "yaw", "clock")]):
+        if np.count_nonzero(found.used) <= len([s for s in found.states if s in ("x", "y", "z", "yaw", "clock")]):
             return False
         here = estimate(predict(self.belief, found.time_s, self.motion), self.site, who, "predicted")
         apart = position[:2] - here.position_m[:2]
-        spread = here.covariance[:2, :2] + found.covariance[:2, :2]
-        return bool(apart @ np.linalg.solve(spread, apart) > CONTRADICTED)
+        (xx, xy), (_, yy) = here.covariance[:2, :2] + found.covariance[:2, :2]
+        squared = yy * apart[0] ** 2 - 2 * xy * apart[0] * apart[1] + xx * apart[1] ** 2
+        return bool(squared > CONTRADICTED * (xx * yy - xy**2))
 
     def _gathered(self, vehicle: str) -> Fix:
         """Return a fix from the latest range of each pair within some seconds."""
@@ -203,16 +204,17 @@ class Follower:
         """Count refusals; tell when a vehicle falls silent, is heard again, or a range was left out."""
         for who, vehicle in enumerate(self.site.vehicles):
             touching = self._touches(links, who)
-            heard = bool(np.any(used & touching))
+            asked, believed = np.count_nonzero(touching), np.count_nonzero(used & touching)
+            heard = believed > 0
             if self.belief.placed[who]:
-                if np.any(touching) and np.sum(used & touching) < 0.5 * np.sum(touching):
+                if believed < 0.5 * asked:
                     self._refused[who] += 1
                 else:
                     self._refused[who] = 0
                 if self._heard[who] and not heard:
                     events.append(Event(self.belief.time_s, vehicle.id, "lost", "no range believed in this epoch"))
                 elif heard and not self._heard[who]:
-                    events.append(Event(self.belief.time_s, vehicle.id, "found", f"{np.sum(used & touching)} ranges"))
+                    events.append(Event(self.belief.time_s, vehicle.id, "found", f"{believed} ranges"))
                 self._heard[who] = heard
         for found in fixes:
             if found.status == "ok":
@@ -223,7 +225,7 @@ class Follower:
     def _estimates(self, links: Links, used: NDArray[np.bool_]) -> tuple[Estimate, ...]:
         out = []
         for who in np.flatnonzero(self.belief.placed):
-            entered = bool(np.any(used & self._touches(links, int(who))))
+            entered = bool((used & self._touches(links, int(who))).any())
             out.append(estimate(self.belief, self.site, int(who), "fused" if entered else "predicted"))
         return tuple(out)
 
@@ -232,14 +234,7 @@ def expectations(
     belief: Belief, site: Site, pairs: list[tuple[str, str]], sound_speed_mps: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Range, its deviation, range rate and its deviation that a belief expects of emitter–receiver pairs, each (n,)."""
-    from sonofix.geometry import model
-
-    links = link(site, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs))
-    range_m, rate, by_range, by_rate = model(links, belief.pose(), np.zeros(len(pairs)), sound_speed_mps)
-    own = belief.covariance[:-2, :-2]
-
-    def deviation(derivative: Floats) -> Floats:
-        flat = derivative.reshape(len(pairs), -1)
-        return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", flat, own, flat), 0.0))
-
-    return range_m, np.hypot(deviation(by_range), links.emitter_sd_m), rate, deviation(by_rate)
+    n, links = len(pairs), link(site, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs))
+    shown, derivative = rows_at(links, belief.mean, np.zeros(n), sound_speed_mps, clock=False, rates=True)
+    sd = np.sqrt(np.maximum(np.einsum("ij,ij->i", derivative @ belief.covariance, derivative), 0.0))
+    return shown[:n], np.hypot(sd[:n], links.emitter_sd_m), shown[n:], sd[n:]

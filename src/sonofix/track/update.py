@@ -10,13 +10,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, model
+from sonofix.geometry import Links, rows_at
 from sonofix.locate.noise import row_noise
 from sonofix.records import Floats, RangeEpoch
 from sonofix.track.belief import Belief
 
 GATE_SIGMA = 5.0
 """A row this many deviations from its prediction is not believed."""
+
+SETTLED = 1e-6
+"""Iterations end when nothing in the state moves by more, in its own unit."""
 
 
 def update(
@@ -39,67 +42,43 @@ def update(
     used = np.zeros(len(epoch), bool)
     placed = np.append(belief.placed, True)
     rows = np.flatnonzero(candidates & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
-    if not len(rows) or (epoch.clock == "common" and not belief.free[-2]):
+    clock, with_rates = epoch.clock == "common", epoch.range_rate_mps is not None
+    if not len(rows) or (clock and not belief.free[-2]):
         return belief, used, np.zeros(0)
     dt = epoch.time_s[rows] - belief.time_s
-    covariance_r, rates = row_noise(epoch, links, rows, dt)
-    miss, derivative = _misfit(belief.mean, epoch, links.rows(rows), rows, dt)
-    spread = np.einsum("ij,jk,ik->i", derivative, belief.covariance, derivative)
-    n = len(rows)
-    surprise = miss[:n] ** 2 / (spread[:n] + np.diag(covariance_r))
-    near = surprise <= GATE_SIGMA**2
-    if rates is not None:
-        near &= np.abs(miss[n:]) <= GATE_SIGMA * np.sqrt(spread[n:] + np.diag(rates))
-    if n > 2 and 2 * np.sum(near) < n:
+    noise = row_noise(epoch, links, rows, dt)
+    measured = epoch.range_m[rows]
+    if epoch.range_rate_mps is not None:
+        measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
+    links = links.rows(rows)
+    shown, derivative = rows_at(links, belief.mean, dt, epoch.sound_speed_mps, clock, with_rates)
+    miss = measured - shown
+    crossed = derivative @ belief.covariance
+    surprise = miss**2 / (np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal())
+    # a row is believed where its range is, and its rate if it has one
+    near = (surprise <= GATE_SIGMA**2).reshape(-1, len(rows)).all(axis=0)
+    surprise = surprise[: len(rows)]
+    if len(rows) > 2 and 2 * np.count_nonzero(near) < len(rows):
         # most disagree: those that do not may do so by chance, and would drag the track along
         near[:] = False
-    rows, dt = rows[near], dt[near]
-    if not len(rows):
+    if not near.any():
         return belief, used, surprise
-    used[rows] = True
-    n = len(rows)
-    noise_all = covariance_r[np.ix_(near, near)]
-    if rates is not None:
-        ranges = noise_all
-        noise_all = np.zeros((2 * n, 2 * n))
-        noise_all[:n, :n] = ranges
-        noise_all[n:, n:] = rates[np.ix_(near, near)]
-    mean = belief.mean
-    chosen = links.rows(rows)
-    gain = derivative = np.zeros((0, 0))
-    for _ in range(iterations):
-        miss, derivative = _misfit(mean, epoch, chosen, rows, dt)
-        crossed = belief.covariance @ derivative.T
-        innovation = derivative @ crossed + noise_all
-        gain = np.linalg.solve(innovation, crossed.T).T
+    used[rows[near]] = True
+    if not near.all():
+        both = np.tile(near, 2) if with_rates else near
+        links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
+        miss, derivative, crossed = miss[both], derivative[both], crossed[both]
+    mean, gain = belief.mean, np.zeros((0, 0))
+    for k in range(iterations):
+        if k:
+            shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, with_rates)
+            miss, crossed = measured - shown, derivative @ belief.covariance
+        gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
         moved = belief.mean + gain @ (miss - derivative @ (belief.mean - mean))
-        settled = float(np.max(np.abs(moved - mean))) < 1e-6
+        settled = float(np.abs(moved - mean).max()) < SETTLED
         mean = moved
         if settled:
             break
     keep = np.eye(len(mean)) - gain @ derivative
-    covariance = keep @ belief.covariance @ keep.T + gain @ noise_all @ gain.T
+    covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
     return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2), used, surprise
-
-
-def _misfit(
-    mean: Floats, epoch: RangeEpoch, links: Links, rows: NDArray[np.int64], dt: Floats
-) -> tuple[Floats, Floats]:
-    """Measured less expected ranges (then rates), and the derivative of what is expected by the whole state."""
-    range_m, rate, by_range, by_rate = model(links, mean[:-2].reshape(-1, 8), dt, epoch.sound_speed_mps)
-    clock = epoch.clock == "common"
-    n = len(rows)
-    derivative = np.zeros((n, len(mean)))
-    derivative[:, :-2] = by_range.reshape(n, -1)
-    miss = epoch.range_m[rows] - range_m
-    if clock:
-        # the clock's drift within an epoch is far below any range's deviation
-        derivative[:, -2] = 1.0
-        miss = miss - mean[-2]
-        rate = rate + mean[-1]
-    if epoch.range_rate_mps is None:
-        return miss, derivative
-    rates = np.zeros((n, len(mean)))
-    rates[:, :-2] = by_rate.reshape(n, -1)
-    rates[:, -1] = 1.0 if clock else 0.0
-    return np.concatenate([miss, epoch.range_rate_mps[rows] - rate]), np.vstack([derivative, rates])
