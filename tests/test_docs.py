@@ -156,7 +156,8 @@ def test_rooms_named_exist_and_existing_rooms_are_named():
     assert named == there
 
 
-def test_the_picture_is_there_and_small():
-    picture = ROOT / "docs" / "track.png"
+@pytest.mark.parametrize(("name", "most"), [("track.png", 600_000), ("explain.png", 250_000)])
+def test_the_pictures_are_there_and_small(name, most):
+    picture = ROOT / "docs" / name
     assert picture.read_bytes().startswith(b"\x89PNG")
-    assert picture.stat().st_size <= 600_000
+    assert picture.stat().st_size <= most

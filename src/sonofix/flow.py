@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.acquire.epochs import Schedule, Window, reach_s, screen
+from sonofix.acquire.explain import Hearing, insight
 from sonofix.acquire.plan import acquire, make_plan
 from sonofix.locate.fix import fix
 from sonofix.ranging import range_epoch, stated_epochs
@@ -21,6 +23,7 @@ from sonofix.records import (
     Estimate,
     Event,
     Floats,
+    Insight,
     Prediction,
     RangeEpoch,
     Recording,
@@ -99,6 +102,57 @@ def _run_samples(
     yield last
 
 
+def explain(recording: Recording, epoch: int, microphone: str | None = None) -> Insight:
+    """Run a recording up to one epoch and tell what the receiver saw in it.
+
+    Parameters
+    ----------
+    recording : Recording
+        With samples.
+    epoch : int
+        Steps of `run` before it; 0 is the first.
+    microphone : str or None
+        By id; None: the first with a channel.
+
+    Raises
+    ------
+    ValueError
+        If there are no samples, the run has fewer epochs, or there is no such microphone.
+    """
+    site = recording.site
+    if recording.blocks is None or recording.rate_hz is None:
+        raise ValueError("the recording has no samples (capture.flac, capture.wav): there is nothing to look into")
+    listening = [m.id for m in site.microphones if m.channel is not None]
+    if microphone is not None and microphone not in listening:
+        known = ", ".join(listening) or "none"
+        raise ValueError(
+            f"microphone {microphone}: no microphone of that id has a channel of the capture; of use: {known}"
+        )
+    if epoch < 0:
+        raise ValueError(f"epoch {epoch}: epochs count from 0")
+    heard: dict[str, Hearing] = {}
+    receiver = Receiver(
+        site,
+        recording.rate_hz,
+        waveforms_of(site, recording.references),
+        recording.sync_s,
+        recording.tables.get("start"),
+        on_hearing=lambda hearing: heard.__setitem__(hearing.receiver, hearing),
+    )
+    fed = chain.from_iterable(receiver.feed(block) for block in recording.blocks(int(recording.rate_hz)))
+    count = 0
+    for step in chain(fed, receiver.finish()):
+        if count == epoch:
+            ranges = step.ranges
+            seen = insight(heard[microphone or listening[0]], epoch, ranges.sync_s, ranges.clock)
+            own = [i for i, r in enumerate(ranges.receiver) if r == seen.microphone]
+            used = {ranges.emitter[i]: bool(step.range_used[i]) for i in own}
+            return replace(seen, used=used, events=step.events)
+        count += 1
+    there = f"epochs 0 to {count - 1}" if count else "no whole epoch"
+    raise ValueError(f"epoch {epoch}: the recording has {there}")
+
+
 class Street:
     """From ranges to estimates: what file, live and stated ranges share."""
 
@@ -173,6 +227,8 @@ class Receiver:
         Known start poses.
     rate_hz : float or None
         Estimates at this rate; None: one an epoch.
+    on_hearing : callable or None
+        Is told what each microphone's epoch was searched for, once it was.
 
     Raises
     ------
@@ -188,6 +244,7 @@ class Receiver:
         sync_s: Floats | None = None,
         start: Table | None = None,
         rate_hz: float | None = None,
+        on_hearing: Callable[[Hearing], None] | None = None,
     ) -> None:
         if site.schedule is None or site.schedule.period_s is None:
             raise ValueError("reading samples needs [schedule] period_s: state how often the beacons burst")
@@ -195,6 +252,7 @@ class Receiver:
         self.waveforms = waveforms
         self.sound_speed_mps = site.sound_speed_mps
         self.sound_speed_sd_mps = 0.0 if site.air.sound_speed_mps is not None else 0.607 * THERMOMETER_SD_K
+        self._on_hearing = on_hearing
         self._microphones = [m for m in site.microphones if m.channel is not None]
         if not self._microphones:
             raise ValueError("no [[microphone]] names a channel of the capture: add channel = 0, 1, …")
@@ -286,8 +344,15 @@ class Receiver:
             }
             expected = {} if window.seeking else self._expect(window, microphone.id, list(windows))
             found, notes = acquire(self._plan, channel, first, microphone.id, windows, expected)
-            if expected and len(found) < 0.7 * self._heard_last / len(self._microphones):
+            repeated = bool(expected) and len(found) < 0.7 * self._heard_last / len(self._microphones)
+            if repeated:
+                expected = {}
                 found, notes = acquire(self._plan, channel, first, microphone.id, windows)
+            if self._on_hearing is not None:
+                why = "the warm search heard too little" if repeated else "no track says where to look"
+                sent_s = {e: window.sync_s + self._offsets_s[e] + microphone.delay_s for e in windows}
+                given = (microphone.id, channel, first, windows, expected)
+                self._on_hearing(Hearing(self._plan, *given, sent_s, odd, "" if expected else why))
             heard += found
             flags += [f"microphone {microphone.id}: {text}" for text in notes]
         self._heard_last = len(heard)

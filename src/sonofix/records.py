@@ -7,7 +7,8 @@ or ride on a vehicle. Quantities that are not known are ``None``, never zero and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -457,3 +458,187 @@ class Calibration:
     residual_rms: Floats
     noise_rms: float
     flags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathInsight:
+    """One way of one burst, as it stands in the receiver's final model, or as it was when it was dropped.
+
+    Attributes
+    ----------
+    range_m, range_sd_m : float
+        As in `RangeEpoch`, by its own noise alone; the deviation is None for what was dropped.
+    range_rate_mps, range_rate_sd_mps : float
+        Positive when receding.
+    level_db : float
+        Correlation power over the noise around it.
+    amplitude : float
+        Of the envelope at the microphone, full scale 1.
+    is_range : bool
+        Whether it is the one reported: the first path of weight.
+    dropped : str
+        Why it was dropped; empty for what was kept.
+    """
+
+    range_m: float
+    range_sd_m: float | None
+    range_rate_mps: float
+    range_rate_sd_mps: float | None
+    level_db: float
+    amplitude: float
+    is_range: bool
+    dropped: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeaconInsight:
+    """What the search for one beacon saw in one epoch.
+
+    Attributes
+    ----------
+    beacon : str
+    range_m : float64 (d,)
+        Ways that the delays stand for, ascending: those of the whole window.
+    range_rate_mps : float64 (m,)
+        Of the replicas, ascending.
+    heard_db, alone_db : float32 (m, d)
+        Correlation power over the noise: in the samples as they came, and when tones, clicks and all other beacons'
+        bursts are taken away.
+    threshold_db : float
+        What a lone peak must exceed over the noise.
+    predicted : (low, high) of the way in m, (low, high) of the range rate in m/s, or None
+        Where the search was warm: what it looked through.
+    paths : tuple of PathInsight
+        Kept and dropped, by way.
+    verdict : str
+        Why no range is reported; empty where one is.
+    """
+
+    beacon: str
+    range_m: Floats
+    range_rate_mps: Floats
+    heard_db: NDArray[np.float32]
+    alone_db: NDArray[np.float32]
+    threshold_db: float
+    predicted: tuple[tuple[float, float], tuple[float, float]] | None
+    paths: tuple[PathInsight, ...]
+    verdict: str
+
+    @property
+    def reported(self) -> PathInsight | None:
+        """The path that is the range."""
+        return next((path for path in self.paths if path.is_range), None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """One stage of taking an epoch apart: what was done, to which beacons' bursts, and what was left.
+
+    ``left_db`` is the power left while bursts sound, over that of the quiet margins.
+    """
+
+    deed: str
+    beacons: tuple[str, ...]
+    left_db: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BandInsight:
+    """One slice of the spectrum, in which the beacons of one carrier were looked for.
+
+    Attributes
+    ----------
+    carrier_hz : float
+    edges_hz : (float, float)
+        Of the pass band.
+    frequency_hz : float64 (k,)
+        Ascending, within the edges.
+    heard_db, clean_db, left_db : float64 (k,)
+        Power density, dB of full scale² per Hz: as heard, when tones and clicks are taken out, and when all bursts are.
+    quiet_db : float or None
+        That of the quieter of the two margins, if it were white over the band; None where they are silence itself.
+    tones_hz : tuple of float
+        Steady tones that were taken out.
+    time_s : float64 (n,)
+        Recorder's clock.
+    heard_power_db, left_power_db : float64 (n,)
+        Power by time, smoothed over 1 ms, over that of the quiet margins: as heard, and when all is taken out.
+    aside : bool (n,)
+        Set aside as clicks or drop-outs.
+    stages : tuple of Stage
+    beacons : tuple of BeaconInsight
+    """
+
+    carrier_hz: float
+    edges_hz: tuple[float, float]
+    frequency_hz: Floats
+    heard_db: Floats
+    clean_db: Floats
+    left_db: Floats
+    quiet_db: float | None
+    tones_hz: tuple[float, ...]
+    time_s: Floats
+    heard_power_db: Floats
+    left_power_db: Floats
+    aside: NDArray[np.bool_]
+    stages: tuple[Stage, ...]
+    beacons: tuple[BeaconInsight, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Insight:
+    """One epoch of one microphone as the receiver saw it, from the spectrum to the paths.
+
+    Attributes
+    ----------
+    epoch : int
+        Steps before this one in the run.
+    sync_s : float
+        When the epoch began, recorder's clock.
+    microphone : str
+    search : str
+        "warm" round predictions from the track, or "cold" and why.
+    sound_speed_mps : float
+    clock : "known" or "common"
+        "common": all ways share one unknown offset.
+    frequency_hz, spectrum_db : float64 (k,)
+        Of the samples as recorded: power density, dB of full scale² per Hz.
+    bands : tuple of BandInsight
+    detections : tuple of Detection
+        What the epoch reported; strongest first.
+    notes : tuple of str
+        What was odd about the samples, and what was done to them.
+    used : mapping from beacon id to bool
+        For each range reported whether the run used it.
+    events : tuple of Event
+        Of that step of the run.
+    """
+
+    epoch: int
+    sync_s: float
+    microphone: str
+    search: str
+    sound_speed_mps: float
+    clock: Literal["known", "common"]
+    frequency_hz: Floats
+    spectrum_db: Floats
+    bands: tuple[BandInsight, ...]
+    detections: tuple[Detection, ...]
+    notes: tuple[str, ...]
+    used: Mapping[str, bool]
+    events: tuple[Event, ...]
+
+    def left_out(self, beacons: Iterable[BeaconInsight]) -> list[str]:
+        """Say what was excluded and why, a reason a line: samples, ranges and paths of some of the beacons."""
+        shown = list(beacons)
+        lines = [f"Samples: {note}." for note in self.notes]
+        lines += [f"{b.beacon}: no range; {b.verdict}." for b in shown if b.verdict]
+        unused = [b.beacon for b in shown if b.reported is not None and not self.used.get(b.beacon, True)]
+        if unused:
+            lines.append(f"{', '.join(unused)}: ranged, but believed by no fix nor track.")
+        lines += [f"Run: {event.event}; {event.detail}." for event in self.events if event.event != "samples"]
+        why = Counter("no higher" in p.dropped for b in shown for p in b.paths if p.dropped)
+        for alike, reason in ((False, "too faint"), (True, "no higher than other peaks of their search")):
+            if why[alike]:
+                lines.append(f"Paths: {why[alike]} that were tried proved {reason} when all else was taken away.")
+        return lines

@@ -5,7 +5,7 @@ What is done with it, epoch by epoch, stands in `separate`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank, make_bank
 from sonofix.acquire.baseband import Band, band_limited, design_band, downconvert
-from sonofix.acquire.separate import Separation
+from sonofix.acquire.separate import Separation, Watch
 from sonofix.acquire.tones import MARGIN_S, find_tones, level_db
 from sonofix.records import Detection, Prediction, Waveform
 
@@ -118,28 +118,42 @@ def acquire(
     """
     notes: list[str] = []
     found: list[Detection] = []
-    for band, banks in plan.bands:
-        baseband, start_s = downconvert(samples, first_sample, band)
-        if len(baseband):
-            listening = [b for b in banks if b.emitter in windows]
-            tones = find_tones(baseband, band.rate_hz)
-            left = baseband - sum(tone.course for tone in tones)
-            for tone in tones:
-                text = f"a tone at {(band.carrier_hz + tone.offset_hz) / 1e3:.3f} kHz"
-                notes.append(f"{text}, {level_db(tone, left):.0f} dB over all else in the band, was taken out")
-            job = Separation(
-                band,
-                listening,
-                baseband,
-                start_s,
-                tones,
-                windows,
-                sound_speed_mps=plan.sound_speed_mps,
-                kappa_sd=plan.kappa_sd,
-                false_alarm_rate=plan.false_alarm_rate,
-            )
-            job.run(predictions or {})
-            notes += job.notes
-            found += job.detections(receiver)
+    for job in taken_apart(plan, samples, first_sample, windows, predictions):
+        notes += job.notes
+        found += job.detections(receiver)
     found.sort(key=lambda detection: -detection.amplitude)
     return tuple(found), tuple(notes)
+
+
+def taken_apart(
+    plan: Plan,
+    samples: NDArray[np.float32],
+    first_sample: int,
+    windows: Mapping[str, tuple[float, float]],
+    predictions: Mapping[str, Prediction] | None = None,
+    watch: Watch | None = None,
+) -> Iterator[Separation]:
+    """Do the work of `acquire` and yield it, band by band; ``watch`` is told each step of it."""
+    for band, banks in plan.bands:
+        baseband, start_s = downconvert(samples, first_sample, band)
+        if not len(baseband):
+            continue
+        tones = find_tones(baseband, band.rate_hz)
+        job = Separation(
+            band,
+            [b for b in banks if b.emitter in windows],
+            baseband,
+            start_s,
+            tones,
+            windows,
+            sound_speed_mps=plan.sound_speed_mps,
+            kappa_sd=plan.kappa_sd,
+            false_alarm_rate=plan.false_alarm_rate,
+            watch=watch,
+        )
+        left = baseband - sum(tone.course for tone in tones)
+        for tone in tones:
+            text = f"a tone at {(band.carrier_hz + tone.offset_hz) / 1e3:.3f} kHz"
+            job.notes.append(f"{text}, {level_db(tone, left):.0f} dB over all else in the band, was taken out")
+        job.run(predictions or {})
+        yield job

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank
 from sonofix.acquire.baseband import Band
-from sonofix.records import Floats
 
 ROWS_AT_ONCE = 16
 """Velocities transformed in one go: what stays in the cache."""
@@ -25,7 +24,7 @@ BLOCK_TURN_RAD = 0.6
 CENTRE_SLIP = 0.25
 """Of the shortest time a burst resolves: how far its ends may slip against the replica of a warm search."""
 
-EVERY = 7
+EVERY = 23
 """One delay in so many tells the noise of a cold search."""
 
 REMAINDER = 0.4
@@ -101,8 +100,10 @@ def profile(
     best = np.full(count, -1.0, np.float32)
     row = np.zeros(count, np.int64)
     some = np.empty((len(spectra), (count - 1) // EVERY + 1), np.float32)
+    work = np.empty((ROWS_AT_ONCE, length), np.complex64)  # one that stays in the cache
     for low in range(0, len(spectra), ROWS_AT_ONCE):
-        product = spectra[low : low + ROWS_AT_ONCE] * spectrum
+        rows = spectra[low : low + ROWS_AT_ONCE]
+        product = np.multiply(rows, spectrum, out=work[: len(rows)])
         surface = np.asarray(scipy.fft.ifft(product, axis=-1, overwrite_x=True))
         _highest(surface, low, best, row, some)
     return best, row, some
@@ -128,8 +129,8 @@ def search_near(
     betas = bank.range_rate_mps[low:high] / bank.sound_speed_mps
     half_s, turn = bank.waveform.duration_s / 2, 2 * np.pi * bank.waveform.carrier_hz
     stretch = baseband[first : first + count - 1 + bank.replicas.shape[1]]
-    best = np.full(count, -1.0, np.float32)
-    row = np.zeros(count, np.int64)
+    parts = np.ascontiguousarray(stretch.astype(np.complex64))
+    power = np.empty((len(betas), count), np.float32)
     # replicas far enough apart in velocity that none in between slips by more than a fraction of a chip
     slip = bank.step / bank.sound_speed_mps * half_s * band.half_width_hz
     per_centre = max(1, int(2 * CENTRE_SLIP / max(slip, 1e-9)))
@@ -138,11 +139,14 @@ def search_near(
         centre = begin + len(group) // 2
         offset = group - betas[centre]
         widest = turn * float(np.max(np.abs(offset), initial=1e-9))
-        size = max(8, int(BLOCK_TURN_RAD / widest * band.rate_hz))
-        blocks = -(-bank.replicas.shape[1] // size)
-        middle_s = (np.arange(blocks) + 0.5) * size / band.rate_hz - bank.lead_s - half_s
-        twiddles = np.exp(1j * turn * np.outer(offset, middle_s))
-        near(stretch, bank.replicas[low + centre], size, twiddles, low + begin, best, row)
+        size = int(min(max(16, BLOCK_TURN_RAD / widest * band.rate_hz), bank.replicas.shape[1]))
+        sums = block_sums(parts, bank.replicas[low + centre], size, count)
+        middle_s = (np.arange(sums.shape[1]) + 0.5) * size / band.rate_hz - bank.lead_s - half_s
+        turned = np.exp(1j * turn * np.outer(offset, middle_s)).astype(np.complex64) @ sums.T
+        power[begin : begin + per_centre] = turned.real**2 + turned.imag**2
+    row = np.argmax(power, axis=0)
+    best = power[row, np.arange(count)]
+    row += low
     heard = stretch[stretch != 0]
     noise = band.whiteness * float(np.vdot(heard, heard).real) / max(len(heard), 1)
     return _peak(best, row, start_s, first, bank, band, known_s, noise, count * len(betas), false_alarm_rate)
@@ -208,33 +212,20 @@ def _highest(
 
 
 @numba.njit(cache=True, fastmath=True)
-def near(
-    stretch: NDArray[np.complex128],
-    replica: NDArray[np.complex64],
-    size: int,
-    twiddles: NDArray[np.complex128],
-    low: int,
-    best: Floats,
-    row: NDArray[np.int64],
-) -> None:
-    """Correlation powers at the delays of ``best`` and the velocities of ``twiddles`` (m, blocks); keep the highest."""
-    blocks = twiddles.shape[1]
-    sums = np.empty(blocks, np.complex128)
-    real, imag = stretch.real.astype(np.float32), stretch.imag.astype(np.float32)
+def block_sums(
+    stretch: NDArray[np.complex64], replica: NDArray[np.complex64], size: int, count: int
+) -> NDArray[np.complex64]:
+    """Correlation with a replica at ``count`` delays, in blocks of ``size`` samples each: (count, blocks)."""
+    blocks = (replica.shape[0] + size - 1) // size
+    out = np.empty((count, blocks), np.complex64)
+    real, imag = stretch.real.copy(), stretch.imag.copy()
     re, im = replica.real.copy(), replica.imag.copy()
-    for delay in range(best.shape[0]):
+    for delay in range(count):
         for block in range(blocks):
             same = np.float32(0.0)
             cross = np.float32(0.0)
             for n in range(block * size, min((block + 1) * size, re.shape[0], real.shape[0] - delay)):
                 same += re[n] * real[delay + n] + im[n] * imag[delay + n]
                 cross += re[n] * imag[delay + n] - im[n] * real[delay + n]
-            sums[block] = complex(same, cross)
-        for m in range(twiddles.shape[0]):
-            total = 0.0 + 0.0j
-            for block in range(blocks):
-                total += twiddles[m, block] * sums[block]
-            power = total.real**2 + total.imag**2
-            if power > best[delay]:
-                best[delay] = power
-                row[delay] = low + m
+            out[delay, block] = complex(same, cross)
+    return out

@@ -8,8 +8,10 @@ since in a crowd only the loudest is what it looks like.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,24 +21,27 @@ from sonofix.acquire.baseband import Band
 from sonofix.acquire.refine import FRESH_RAD, STALE_RAD, Burst, Joint
 from sonofix.acquire.search import Peak, search, search_near
 from sonofix.acquire.tones import MARGIN_S, Tone, refit
-from sonofix.records import Detection, Floats, Path, Prediction
+from sonofix.records import Detection, Floats, Path, Prediction, Waveform
 
 STANDS_OUT = 10 ** (3 / 10)
 """Over the second highest of its own search: cross-talk and echoes make many peaks alike."""
+
+HIGH = 4.0
+"""Times the threshold: more than the highest of the forest of peaks that cross-talk makes."""
 
 NEAR_STRONGEST = 10 ** (-12 / 10)
 """Accepted beside the strongest, unless it stands out by ``ALONE``: codes may resemble each other at one lag."""
 
 ALONE = 10 ** (6 / 10)
 
+STAYS = 10 ** (-2 / 10)
+"""Of its power: what a peak keeps at least when louder bursts are taken away, if it is a burst."""
+
 PATH_POWER = 10 ** (-12 / 10)
 """A path before a burst's strongest one is its direct path where it has more than this share of its power."""
 
 UNEXPLAINED = 1.3
 """Power left while bursts sound, over that of their quiet margins, at which there must be more to find."""
-
-RESIDUE = 10 ** (-12 / 10)
-"""What a poorly matched burst leaves behind is weaker than this share of it."""
 
 ECHO_POWER = 10 ** (-26 / 10)
 """Weaker echoes than this share of a burst's strongest path are not looked for."""
@@ -71,6 +76,14 @@ class Sound:
     clear: bool
 
 
+Deed = Literal["taken", "aside", "unpredicted", "weak", "alike"]
+"""Paths were taken, or impulses set aside; or no burst came as predicted; or paths are to be dropped because they do
+not stand above the noise, or no higher than other peaks of their search."""
+
+Watch = Callable[["Separation", Deed, Sequence[int]], None]
+"""Is told what was done, or is about to be, and to which of the ``sounds``, by index."""
+
+
 class Separation:
     """The work on one epoch of one microphone in one band.
 
@@ -87,6 +100,8 @@ class Separation:
         When its burst may begin to be heard.
     sound_speed_mps, kappa_sd, false_alarm_rate : float
         As in `plan.Plan`.
+    watch : Watch or None
+        Is told what is done.
     """
 
     def __init__(
@@ -101,12 +116,15 @@ class Separation:
         sound_speed_mps: float,
         kappa_sd: float,
         false_alarm_rate: float,
+        watch: Watch | None = None,
     ) -> None:
         self.band, self.banks, self.windows = band, banks, windows
         self.baseband, self.start_s = baseband, start_s
         self.sound_speed_mps, self.false_alarm_rate = sound_speed_mps, false_alarm_rate
         self.tones = tones
+        self._watch = watch
         self.notes: list[str] = []
+        self._settled = False
         self.sounds: list[Sound] = []
         self.joint = Joint(
             baseband - self._tone(), start_s, band.rate_hz, kappa_sd, band.whiteness, max(1, 2 * len(banks))
@@ -122,9 +140,15 @@ class Separation:
         self._take_beacons(predictions)
         if predictions and not self.sounds:
             self._predictions = {}
+            self._tell("unpredicted", ())
             self._take_beacons({})
-        self._leave_out_impulses()
-        self._take_crowd()
+        self._settle()
+        if self._disturbed():
+            self._leave_out_impulses()
+            self._take_crowd()
+        elif self._prune():
+            # what had been mistaken for a burst may have hidden it
+            self._take_beacons(self._predictions)
         self._prune()
         if self._disturbed():
             self._verify()
@@ -146,34 +170,54 @@ class Separation:
         if np.mean(aside) > IMPULSE_SHARE or np.sum(power[aside]) < 0.5 * np.sum(power):
             return
         self.joint.leave_out(aside)
-        self._settle(FULL_ITERATIONS)
+        self._settled = False
+        self._settle()
         lasted_ms = 1e3 * np.sum(aside) / self.band.rate_hz
         self.notes.append(f"{len(runs)} clicks or drop-outs, {lasted_ms:.0f} ms in all, were left out")
+        self._tell("aside", ())
 
     def _verify(self) -> None:
-        """Drop bursts that stand no higher than other peaks of their code do, in what all other bursts leave."""
+        """Drop what no longer stands above the cross-talk of all that is left, beside what no burst explains."""
         doubtful = set(self.windows)
         while doubtful:
             dropped = [i for i, s in enumerate(self.sounds) if s.bank.emitter in doubtful and not self._stands_out(i)]
             doubtful = {self.sounds[i].bank.emitter for i in dropped}
             if dropped:
+                self._tell("alike", dropped)
                 self._keep([i for i in range(len(self.sounds)) if i not in dropped])
                 self._prune()
 
     def _stands_out(self, i: int) -> bool:
+        """Whether a burst stands out of a search of its code in what all other bursts leave.
+
+        Cross-talk makes a forest of peaks, none far above the mean; a path may have echoes as strong, but stands high.
+        """
         bank = self.sounds[i].bank
         known_s = [self._begins_s(k) for k, s in enumerate(self.sounds) if s.bank is bank and k != i]
         heard = self.joint.residual_with(i)
         peak = search(heard, self.start_s, bank, self.band, *self.windows[bank.emitter], known_s, self.false_alarm_rate)
-        return peak is not None and self._energy(i) > STANDS_OUT * peak.second
+        if peak is None:
+            return False
+        energy, floor = self._energy(i), peak.threshold * peak.noise
+        return energy > floor and (energy > STANDS_OUT * peak.second or energy > HIGH * floor)
+
+    def _tell(self, deed: Deed, which: Sequence[int]) -> None:
+        if self._watch is not None:
+            self._watch(self, deed, which)
 
     def _keep(self, which: list[int]) -> None:
         self.sounds = [self.sounds[i] for i in which]
         self.joint.keep(which)
+        self._settled = False
 
     def _take_beacons(self, predictions: Mapping[str, Prediction]) -> None:
         """Accept what stands out, and search the rest in what is left."""
+        before: list[tuple[Bank, Peak]] = []
         while True:
+            # the louder gone, what is still there was no cross-talk
+            stayed = [(bank, peak) for bank, old in before if (peak := self._stays(bank, old)) is not None]
+            if stayed:
+                self._accept(stayed)
             missing = [bank for bank in self.banks if not any(s.bank is bank for s in self.sounds)]
             found = [(bank, peak) for bank in missing if (peak := self._look(bank, predictions)) is not None]
             if not found:
@@ -182,7 +226,7 @@ class Separation:
             sure = [
                 (bank, peak)
                 for bank, peak in found
-                if peak.power > peak.threshold * peak.noise
+                if (peak.power > peak.threshold * peak.noise or not predictions)
                 and peak.power > (STANDS_OUT if peak.power >= NEAR_STRONGEST * strongest else ALONE) * peak.second
             ]
             if not sure:
@@ -191,6 +235,27 @@ class Separation:
                     return
                 sure = [max(found, key=lambda one: one[1].power)]
             self._accept(sure)
+            if not predictions:
+                accepted = {bank.emitter for bank, _ in sure}
+                before = [(bank, peak) for bank, peak in found if bank.emitter not in accepted]
+
+    def _stays(self, bank: Bank, old: Peak) -> Peak | None:
+        """Look where an emitter's highest peak was before louder bursts were taken away; None if it went with them."""
+        reach_s = 2 / self.band.rate_hz
+        peak = search_near(
+            self.joint.residual,
+            self.start_s,
+            bank,
+            self.band,
+            old.start_s - reach_s,
+            old.start_s + reach_s,
+            (old.range_rate_mps - bank.step, old.range_rate_mps + bank.step),
+            [],
+            self.false_alarm_rate,
+        )
+        if peak is None or peak.power < STAYS * old.power or peak.power < old.threshold * peak.noise:
+            return None
+        return replace(peak, threshold=old.threshold)
 
     def _take_crowd(self) -> None:
         """Accept paths of all bursts, one at a time, while more remains than noise."""
@@ -251,31 +316,37 @@ class Separation:
             self.joint.add(Burst(bank.waveform, middle_s, peak.range_rate_mps / self.sound_speed_mps, 0.0, 0j))
             clear = peak.power > peak.threshold * peak.noise and peak.power > STANDS_OUT * peak.second
             self.sounds.append(Sound(bank, peak.power, peak.threshold, clear))
-        self._settle(ROUGH_ITERATIONS, STALE_RAD)
+        self._settled = False
+        self._settle(rough=True)
+        self._tell("taken", range(len(self.sounds) - len(found), len(self.sounds)))
 
-    def _settle(self, iterations: int, stale_rad: float = FRESH_RAD) -> None:
+    def _settle(self, rough: bool = False) -> None:
         """Refine all paths together, then the tones in what they leave."""
-        self.joint.settle(iterations, stale_rad)
+        if self._settled:
+            return
+        self.joint.settle(*((ROUGH_ITERATIONS, STALE_RAD) if rough else (FULL_ITERATIONS, FRESH_RAD)))
+        self._settled = not rough
         if self.tones:
             self.tones = refit(self.tones, self.joint.residual + self._tone(), self.band.rate_hz)
             self.joint.replace_baseband(self.baseband - self._tone())
 
-    def _prune(self) -> None:
-        """Drop what was only tried and does not stand out even now that all else is gone."""
+    def _prune(self) -> bool:
+        """Drop what was only tried and does not stand out even now that all else is gone; say whether there was any."""
+        before = len(self.sounds)
         while self.sounds:
-            self._settle(FULL_ITERATIONS)
+            self._settle()
             noise = self.joint.noise()
             energy = np.array([self._energy(i) for i in range(len(self.sounds))])
-            # beside what no burst explains, a weak peak may be part of it, however clear it looked
-            weak = RESIDUE * float(np.max(energy)) if self._disturbed() else 0.0
             sure = [
                 i
                 for i, s in enumerate(self.sounds)
-                if (s.clear and energy[i] >= weak) or energy[i] > s.threshold * noise[i]
+                if s.clear or energy[i] > s.threshold * noise[i] or self._stands_out(i)
             ]
             if len(sure) == len(self.sounds):
                 break
+            self._tell("weak", sorted(set(range(len(self.sounds))) - set(sure)))
             self._keep(sure)
+        return len(self.sounds) < before
 
     def detections(self, receiver: str) -> list[Detection]:
         """Report each emitter by its first path of weight, where the samples hold that whole."""
@@ -361,12 +432,17 @@ class Separation:
         return self._begins_s(i) >= max(self.start_s, guard_s) and burst.arrival_s + half_s <= end_s
 
 
+@lru_cache(maxsize=256)
+def mean_power(w: Waveform) -> float:
+    """Of a burst of unit gain, from its first chip to its last."""
+    inside = slice(int(-w.start_s * w.rate_hz), int((w.duration_s - w.start_s) * w.rate_hz))
+    return float(np.mean(np.abs(w.envelope[inside]) ** 2))
+
+
 def _detection(
     emitter: str, burst: Burst, own: list[Burst], covariance: Floats, noise: float, receiver: str
 ) -> Detection:
-    w = burst.waveform
-    inside = slice(int(-w.start_s * w.rate_hz), int((w.duration_s - w.start_s) * w.rate_hz))
-    power = abs(burst.gain) ** 2 * float(np.mean(np.abs(w.envelope[inside]) ** 2))
+    power = abs(burst.gain) ** 2 * mean_power(burst.waveform)
     paths = tuple(
         Path(
             b.arrival_s - burst.arrival_s,

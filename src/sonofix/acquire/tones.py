@@ -41,6 +41,8 @@ def find_tones(baseband: Complexes, rate_hz: float) -> list[Tone]:
     baseband : complex128 (n,)
         A whole epoch with ``MARGIN_S`` of quiet at both ends (where the recording had begun and not yet ended).
     """
+    import scipy.fft
+
     tones: list[Tone] = []
     left = baseband
     edge = int(MARGIN_S * rate_hz)
@@ -48,16 +50,21 @@ def find_tones(baseband: Complexes, rate_hz: float) -> list[Tone]:
     if len(sounding) < 8 * edge:
         return tones
     stretch = slice(sounding[0], sounding[-1] + 1)
+    ends = [slice(sounding[0], sounding[0] + edge), slice(sounding[-1] + 1 - edge, sounding[-1] + 1)]
+    window = np.hanning(stretch.stop - stretch.start)
+    size = int(scipy.fft.next_fast_len(2 * len(window)) or 0)
     for _ in range(MOST_TONES):
         heard = left[stretch]
-        spectrum = np.abs(np.fft.fft(heard * np.hanning(len(heard)), 4 * len(heard))) ** 2
+        spectrum = np.abs(scipy.fft.fft((heard * window).astype(np.complex64), size)) ** 2
         peak = int(np.argmax(spectrum))
         if spectrum[peak] < STANDS_OUT * np.median(spectrum):
             break
+        offset_hz = float(np.fft.fftfreq(size, 1.0 / rate_hz)[peak])
+        level = float(np.sqrt(spectrum[peak])) / float(np.sum(window))
+        if any(_level(left[end], rate_hz, offset_hz) < 0.3 * level for end in ends):
+            break
         course = np.zeros_like(left)
-        offset_hz = float(np.fft.fftfreq(len(spectrum), 1.0 / rate_hz)[peak])
         course[stretch] = _follow(heard, rate_hz, offset_hz)
-        ends = [slice(sounding[0], sounding[0] + edge), slice(sounding[-1] + 1 - edge, sounding[-1] + 1)]
         if not all(_alike(left[end], course[end]) for end in ends):
             break
         tones.append(Tone(offset_hz, course))
@@ -97,6 +104,11 @@ def _follow(heard: Complexes, rate_hz: float, offset_hz: float, rounds: int = 6)
         phase = phase + np.clip(step[:4], -1.0, 1.0)
         level = level + step[4:]
     return np.asarray((level @ powers[:2]) * np.exp(1j * (phase @ powers)) * mixer, np.complex128)
+
+
+def _level(heard: Complexes, rate_hz: float, offset_hz: float) -> float:
+    """Amplitude of a stretch's part at a frequency."""
+    return abs(complex(np.mean(heard * np.exp(-2j * np.pi * offset_hz / rate_hz * np.arange(len(heard))))))
 
 
 def _alike(heard: Complexes, course: Complexes) -> bool:

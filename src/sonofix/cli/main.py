@@ -14,6 +14,7 @@ from sonofix.cli.check import check
 from sonofix.cli.codes import codes
 from sonofix.cli.console import Stopped
 from sonofix.cli.demo import demo
+from sonofix.cli.explain import explain
 from sonofix.cli.run import run
 from sonofix.cli.score import score
 from sonofix.cli.simulate import simulate
@@ -98,7 +99,7 @@ def sonofix(
     """Positioning by sound: from microphone samples to a fused track."""
 
 
-for command in (run, check, simulate, score, codes, calibrate, demo):
+for command in (run, check, simulate, score, explain, codes, calibrate, demo):
     app.command()(command)
 
 
