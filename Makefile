@@ -3,6 +3,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
+# many small matrix products: threads inside each would only wait for each other
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo test check prove bench format lock clean
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +26,14 @@ def beside(job: Callable[[], object], floor: Callable[[], object], turns: int) -
     floor()
     times = np.array([(once(job), once(floor)) for _ in range(turns)])
     return Beside(float(times[:, 0].min()), float(times[:, 1].min()), float(np.median(times[:, 0] / times[:, 1])))
+
+
+def in_turns(jobs: Mapping[str, Callable[[], object]], turns: int) -> dict[str, np.ndarray]:
+    """Time several jobs in turns, as `beside` does two: the times of each, s (turns,)."""
+    for job in jobs.values():
+        job()
+    times = np.array([[once(job) for job in jobs.values()] for _ in range(turns)])
+    return dict(zip(jobs, times.T, strict=True))
 
 
 def once(job: Callable[[], object]) -> float:

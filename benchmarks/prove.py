@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -38,7 +39,9 @@ def main() -> None:
     page = Path(sys.argv[1])
     command = [sys.executable, "-m", "pytest", "-q", "-s", "--no-header", "-m", "prove", "tests/statistics"]
     printed: list[str] = []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
+    # the receiver's statistics run in processes, a core each: threads of BLAS would only wait for each other
+    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as running:
         assert running.stdout is not None
         for line in running.stdout:
             print(line, end="", flush=True)

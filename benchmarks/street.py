@@ -52,7 +52,7 @@ def main() -> None:
     receiver.acquisition(turns=3 if quick else 15)
     channel.simulator(turns=2 if quick else 7)
     fixes.positions(count=50 if quick else 300, turns=2 if quick else 7)
-    receiver.whole_run()
+    receiver.whole_run(20.0 if quick else 120.0, turns=1 if quick else 3)
     memory.peaks([20.0, 60.0] if quick else [60.0, 600.0])
     print(f"\nThe whole took {(time.perf_counter() - begin) / 60:.1f} minutes.")
     if told.into is not None:

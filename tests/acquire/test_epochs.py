@@ -147,7 +147,7 @@ def test_clipped_samples_are_flagged() -> None:
     samples[:20] = 1.0
     samples[20:25] = -1.0
     fit, flags = screen(samples, 48e3)
-    assert flags == ("2.50 % of samples are clipped; lower the gain",)
+    assert flags == ("2.40 % of samples are clipped; lower the gain",)
     np.testing.assert_array_equal(fit, samples)
 
 

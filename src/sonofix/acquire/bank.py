@@ -19,8 +19,8 @@ from sonofix.signals.interpolate import read
 LOSS_DB = 1.0
 """Of correlation power at the edge of a velocity cell, at worst."""
 
-MOST_KEPT = 2
-"""Transform lengths whose spectra are kept: an epoch's, and that of one cut short or of a search for the clock."""
+MOST_KEPT = 3
+"""Transform lengths whose spectra are kept: of a cold search, of a warm one, and of one for the clock or cut short."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -169,12 +169,12 @@ def band_limited(waveform: Waveform, band: Band) -> Waveform:
     pad = fold * (int(np.ceil(len(band.taps) / band.sample_rate_hz * waveform.rate_hz / 2 / fold)) + 4)
     short = int(scipy.fft.next_fast_len(-(-(len(waveform.envelope) + 2 * pad) // fold)) or 0)
     gain = band.response(np.fft.fftfreq(short * fold, 1.0 / waveform.rate_hz))
-    kept = np.fft.fftfreq(short, 1.0 / short).astype(int)
+    kept = np.rint(np.fft.fftfreq(short, 1.0 / short)).astype(int)
 
     def filtered(table: NDArray[np.complex128]) -> NDArray[np.complex128]:
         padded = np.zeros(short * fold, complex)
         padded[pad : pad + len(table)] = table
-        return np.asarray(scipy.fft.ifft((np.asarray(scipy.fft.fft(padded)) * gain)[kept])) / fold
+        return np.asarray(scipy.fft.ifft((np.asarray(scipy.fft.fft(padded)) * gain)[kept] / fold))
 
     envelope = filtered(waveform.envelope)
     signature = envelope if waveform.signature is waveform.envelope else filtered(waveform.signature)

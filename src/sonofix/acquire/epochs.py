@@ -11,7 +11,7 @@ from sonofix.records import Floats
 from sonofix.site import Site
 
 CLIPPED = 0.9995
-"""Of the loudest sample: at or above, a sample counts as clipped, if there are many."""
+"""Of the loudest sample: two in a row at or above count as clipped, if there are many."""
 
 LOUD = 0.25
 """Of full scale: nothing clips below."""
@@ -126,8 +126,9 @@ def screen(samples: NDArray[np.float32], rate_hz: float) -> tuple[NDArray[np.flo
         samples = np.where(finite, samples, np.float32(0))
     size = np.abs(samples)
     loudest = float(np.max(size, initial=0.0))
-    # a recorder may clip below full scale: then its loudest value comes again and again
-    clipped = float(np.mean(size >= CLIPPED * loudest)) if loudest > LOUD else 0.0
+    # a recorder may clip below full scale: then its loudest value comes several times in a row
+    top = size >= CLIPPED * loudest
+    clipped = float(np.mean(top[1:] & top[:-1])) if loudest > LOUD else 0.0
     if clipped > 2e-4:
         flags.append(f"{100 * clipped:.2f} % of samples are clipped; lower the gain")
     if loudest == 0.0:

@@ -123,6 +123,57 @@ def add_model(
 
 
 @numba.njit(cache=True)
+def bent(
+    heard: NDArray[np.complex128],
+    table: NDArray[np.complex128],
+    table_rate_hz: float,
+    table_start_s: float,
+    half_s: float,
+    carrier_hz: float,
+    start_s: float,
+    rate_hz: float,
+    arrival_s: float,
+    betas: Floats,
+    kappas: Floats,
+) -> Floats:
+    """Power (kappas, betas) that one burst's model explains of ``heard`` (n,) at each β and κ, its gain free."""
+    out = np.zeros((kappas.shape[0], betas.shape[0]))
+    step_s = 1.0 / rate_hz
+    for i in range(kappas.shape[0]):
+        bend = _turned(carrier_hz, 0.0, 2.0 * kappas[i], step_s)
+        for j in range(betas.shape[0]):
+            first, last = _sounding(
+                table.shape[0],
+                table_rate_hz,
+                table_start_s,
+                half_s,
+                start_s,
+                rate_hz,
+                heard.shape[0],
+                arrival_s,
+                betas[j],
+                kappas[i],
+            )
+            carrier = 1.0 + 0.0j
+            ahead = 1.0 + 0.0j
+            seen = 0.0 + 0.0j
+            energy = 1e-300
+            for n in range(first, last):
+                u = start_s + n / rate_hz - arrival_s
+                if (n - first) % RENEWED == 0:
+                    carrier = _turned(carrier_hz, betas[j], kappas[i], u)
+                    ahead = _turned(carrier_hz, betas[j], kappas[i], u + step_s) * np.conj(carrier)
+                tau = half_s + u - betas[j] * u - 0.5 * kappas[i] * u * u
+                model = read(table, (tau - table_start_s) * table_rate_hz) * carrier
+                seen += np.conj(model) * heard[n]
+                energy += model.real**2 + model.imag**2
+                carrier *= ahead
+                ahead *= bend
+            out[i, j] = (seen.real**2 + seen.imag**2) / energy
+    return out
+
+
+@numba.njit(cache=True)
 def assemble(products: NDArray[np.complex128], gain: NDArray[np.complex128]) -> Floats:
     """Real normal matrix (5 k, 5 k) of gain (real, imaginary), arrival, β and κ from inner products of unit columns."""
     count = gain.shape[0]

@@ -17,10 +17,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.acquire.kernels import add_model, assemble, columns
+from sonofix.acquire.kernels import add_model, assemble, bent, columns
 from sonofix.records import Floats, Waveform
 
-Complexes = NDArray[np.complexfloating]
+Complexes = NDArray[np.complex128]
 
 STEP_LIMIT = np.array([1e-4, 3e-4, 1e-1])
 """Of one iteration in arrival (s), β and κ (1/s)."""
@@ -34,6 +34,16 @@ SETTLED_RAD = 3e-4
 """A step that turns no phase by more changes nothing: 10 µm."""
 
 MOST_DAMPING = 1e3
+
+PLAUSIBLE = 3.0
+"""Deviations of κ that `Joint.straighten` looks through."""
+
+BEND_STEP_RAD = 1.2
+MOST_BEND_RAD = 24.0
+"""What steps and limits of curvature turn a burst's end by, against its middle."""
+
+MUCH_MORE = 1.15
+"""Power explained, over that of the present fit, at which another curvature is taken."""
 
 ROUNDING = 1e-6
 """Of the normal matrix's unit diagonal: what single precision leaves uncertain of inner products."""
@@ -130,6 +140,11 @@ class Joint:
         for i in range(len(self.bursts)):
             self._renew(i)
 
+    @property
+    def counted(self) -> NDArray[np.bool_]:
+        """Samples that are not left out (n,)."""
+        return ~self._left_out
+
     def settle(self, iterations: int, stale_rad: float = STALE_RAD) -> None:
         """Gauss–Newton on all bursts at once, Levenberg-damped where a step does not lower the misfit."""
         if not self.bursts:
@@ -151,7 +166,7 @@ class Joint:
             # half a chip and a tenth of a metre a second bound what the linearisation can be trusted for
             move = np.clip(step[:, 2:], -STEP_LIMIT, STEP_LIMIT)
             moved = [
-                Burst(b.waveform, *row, complex(g))
+                Burst(b.waveform, row[0], row[1], row[2], complex(g))
                 for b, row, g in zip(
                     self.bursts, (state + move).tolist(), gain + step[:, 0] + 1j * step[:, 1], strict=True
                 )
@@ -165,7 +180,7 @@ class Joint:
                 continue
             self.bursts, self.residual = moved, residual
             state, gain = state + move, np.array([b.gain for b in moved])
-            settled = cost - tried < 1e-9 * cost or np.max(np.abs(move) * self._turn[: len(moved)]) < SETTLED_RAD
+            settled = cost - tried < 1e-7 * cost or np.max(np.abs(move) * self._turn[: len(moved)]) < SETTLED_RAD
             damping /= 4
             if settled:
                 break
@@ -177,15 +192,61 @@ class Joint:
         out[self._left_out] = 0.0
         return out
 
+    def straighten(self, i: int) -> bool:
+        """Look for burst i's curvature over all that is plausible; say whether another explains much more.
+
+        A long burst from a source that speeds up turns its phase by many radians off any straight line, and a descent
+        that began on one ends in a side valley.
+        """
+        burst = self.bursts[i]
+        w = burst.waveform
+        half_s, turn = w.duration_s / 2, 2 * np.pi * w.carrier_hz
+        most = min(PLAUSIBLE * self._kappa_sd, MOST_BEND_RAD / (turn * half_s**2 / 2))
+        kappas = np.linspace(-most, most, 2 * int(np.ceil(most * turn * half_s**2 / 2 / BEND_STEP_RAD)) + 1)
+        # a line along one half of a parabola is off by half the bend it leaves out
+        reach = most * half_s / 2
+        betas = burst.beta + np.linspace(-reach, reach, 2 * int(np.ceil(reach * turn * half_s / BEND_STEP_RAD)) + 1)
+        fixed = (w.envelope, w.rate_hz, w.start_s, half_s, w.carrier_hz, self._start_s, self._rate_hz)
+        heard = self.residual_with(i)
+        power = bent(heard, *fixed, burst.arrival_s, betas, kappas)
+        k, b = np.unravel_index(int(np.argmax(power)), power.shape)
+        now = bent(heard, *fixed, burst.arrival_s, np.array([burst.beta]), np.array([burst.kappa]))[0, 0]
+        if not power[k, b] > MUCH_MORE * now:
+            return False
+        bursts = list(self.bursts)
+        bursts[i] = replace(burst, beta=float(betas[b]), kappa=float(kappas[k]), gain=0j)
+        self.bursts = bursts
+        self._renew(i)
+        self.residual = heard
+        self.bursts[i] = replace(
+            bursts[i], gain=complex(self._seen(i, i + 1)[0, 0] / self._products[4 * i, 4 * i].real)
+        )
+        self._subtract(self.residual, self.bursts[i])
+        self.residual[self._left_out] = 0.0
+        return True
+
+    def matched(self, i: int) -> float:
+        """Power that burst i's signature, without the bare carrier that all bursts share, explains of what is its own.
+
+        That of a burst is its energy; a fit that took other bursts' carrier for its own has less.
+        """
+        burst = self.bursts[i]
+        w = burst.waveform
+        fixed = (w.signature, w.rate_hz, w.start_s, w.duration_s / 2, w.carrier_hz, self._start_s, self._rate_hz)
+        bend = np.array([burst.beta]), np.array([burst.kappa])
+        return float(bent(self.residual_with(i), *fixed, burst.arrival_s, *bend)[0, 0])
+
     def noise(self) -> Floats:
         """White-equivalent power left per sample around each burst (k,)."""
+        # power and samples up to each moment; what is left out counts as neither
         total = np.zeros(len(self.residual) + 1)
         np.cumsum(self.residual.real**2 + self.residual.imag**2, out=total[1:])
+        counted = np.concatenate([[0], np.cumsum(self.counted)])
         first, last = self._support[: len(self.bursts)].T
-        power = self._whiteness * (total[last] - total[first]) / np.maximum(last - first, 1)
+        power = self._whiteness * (total[last] - total[first]) / np.maximum(counted[last] - counted[first], 1)
         # what went into the fit, five real numbers a burst, is missing from what is left
-        span = int(np.max(last, initial=1) - np.min(first, initial=0))
-        share = np.maximum(1.0 - 2.5 * len(self.bursts) / max(span, 1), 0.1)
+        span = counted[int(np.max(last, initial=1))] - counted[int(np.min(first, initial=len(self.residual)))]
+        share = np.maximum(1.0 - 2.5 * len(self.bursts) / max(int(span), 1), 0.1)
         return np.maximum(power / share, 1e-24)
 
     def covariances(self, noise: Floats) -> list[Floats]:

@@ -1,7 +1,6 @@
-"""Delay × velocity search, and detection at a stated false-alarm rate.
+"""Delay × velocity search by FFT, and detection at a stated false-alarm rate.
 
-Cold: the whole plane, by FFT over delays, a row a velocity. Warm: a small part of it round a prediction, by sums over
-short blocks of a burst, which all velocities share.
+Cold: the whole plane, a row a velocity. Warm: few rows and delays round a prediction.
 """
 
 from __future__ import annotations
@@ -18,11 +17,8 @@ from sonofix.acquire.baseband import Band
 ROWS_AT_ONCE = 16
 """Velocities transformed in one go: what stays in the cache."""
 
-BLOCK_TURN_RAD = 0.6
-"""Phase that the fastest velocity of a warm search turns within one block, against its centre."""
-
-CENTRE_SLIP = 0.25
-"""Of the shortest time a burst resolves: how far its ends may slip against the replica of a warm search."""
+SHORT_SEARCH = 256
+"""Delays that a warm search spans at most, mostly."""
 
 EVERY = 23
 """One delay in so many tells the noise of a cold search."""
@@ -89,21 +85,22 @@ def search(
 
 
 def profile(
-    stretch: NDArray[np.complexfloating], bank: Bank, count: int
+    stretch: NDArray[np.complexfloating], bank: Bank, count: int, rows: slice = slice(None)
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
-    """Highest correlation power over all velocities at each of ``count`` delays, its row, and a sample of all cells."""
+    """Highest correlation power over velocities at each of ``count`` delays, its row, and a sample of all cells."""
     import scipy.fft
 
-    length = bank.length(count)
+    # short searches share one length, so that their spectra are computed once
+    length = bank.length(max(count, SHORT_SEARCH))
     spectrum = np.asarray(scipy.fft.fft(stretch.astype(np.complex64), length))
-    spectra = bank.spectra(length)
+    spectra = bank.spectra(length)[rows]
     best = np.full(count, -1.0, np.float32)
     row = np.zeros(count, np.int64)
     some = np.empty((len(spectra), (count - 1) // EVERY + 1), np.float32)
     work = np.empty((ROWS_AT_ONCE, length), np.complex64)  # one that stays in the cache
     for low in range(0, len(spectra), ROWS_AT_ONCE):
-        rows = spectra[low : low + ROWS_AT_ONCE]
-        product = np.multiply(rows, spectrum, out=work[: len(rows)])
+        some_rows = spectra[low : low + ROWS_AT_ONCE]
+        product = np.multiply(some_rows, spectrum, out=work[: len(some_rows)])
         surface = np.asarray(scipy.fft.ifft(product, axis=-1, overwrite_x=True))
         _highest(surface, low, best, row, some)
     return best, row, some
@@ -126,30 +123,12 @@ def search_near(
         return None
     low = max(0, int(np.searchsorted(bank.range_rate_mps, rates[0])) - 1)
     high = max(low + 1, int(np.searchsorted(bank.range_rate_mps, rates[1])) + 1)
-    betas = bank.range_rate_mps[low:high] / bank.sound_speed_mps
-    half_s, turn = bank.waveform.duration_s / 2, 2 * np.pi * bank.waveform.carrier_hz
     stretch = baseband[first : first + count - 1 + bank.replicas.shape[1]]
-    parts = np.ascontiguousarray(stretch.astype(np.complex64))
-    power = np.empty((len(betas), count), np.float32)
-    # replicas far enough apart in velocity that none in between slips by more than a fraction of a chip
-    slip = bank.step / bank.sound_speed_mps * half_s * band.half_width_hz
-    per_centre = max(1, int(2 * CENTRE_SLIP / max(slip, 1e-9)))
-    for begin in range(0, len(betas), per_centre):
-        group = betas[begin : begin + per_centre]
-        centre = begin + len(group) // 2
-        offset = group - betas[centre]
-        widest = turn * float(np.max(np.abs(offset), initial=1e-9))
-        size = int(min(max(16, BLOCK_TURN_RAD / widest * band.rate_hz), bank.replicas.shape[1]))
-        sums = block_sums(parts, bank.replicas[low + centre], size, count)
-        middle_s = (np.arange(sums.shape[1]) + 0.5) * size / band.rate_hz - bank.lead_s - half_s
-        turned = np.exp(1j * turn * np.outer(offset, middle_s)).astype(np.complex64) @ sums.T
-        power[begin : begin + per_centre] = turned.real**2 + turned.imag**2
-    row = np.argmax(power, axis=0)
-    best = power[row, np.arange(count)]
+    best, row, _ = profile(stretch, bank, count, slice(low, high))
     row += low
     heard = stretch[stretch != 0]
     noise = band.whiteness * float(np.vdot(heard, heard).real) / max(len(heard), 1)
-    return _peak(best, row, start_s, first, bank, band, known_s, noise, count * len(betas), false_alarm_rate)
+    return _peak(best, row, start_s, first, bank, band, known_s, noise, count * (high - low), false_alarm_rate)
 
 
 def _delays(
@@ -209,23 +188,3 @@ def _highest(
         for k in range(some.shape[1]):
             value = surface[i, k * EVERY]
             some[low + i, k] = value.real**2 + value.imag**2
-
-
-@numba.njit(cache=True, fastmath=True)
-def block_sums(
-    stretch: NDArray[np.complex64], replica: NDArray[np.complex64], size: int, count: int
-) -> NDArray[np.complex64]:
-    """Correlation with a replica at ``count`` delays, in blocks of ``size`` samples each: (count, blocks)."""
-    blocks = (replica.shape[0] + size - 1) // size
-    out = np.empty((count, blocks), np.complex64)
-    real, imag = stretch.real.copy(), stretch.imag.copy()
-    re, im = replica.real.copy(), replica.imag.copy()
-    for delay in range(count):
-        for block in range(blocks):
-            same = np.float32(0.0)
-            cross = np.float32(0.0)
-            for n in range(block * size, min((block + 1) * size, re.shape[0], real.shape[0] - delay)):
-                same += re[n] * real[delay + n] + im[n] * imag[delay + n]
-                cross += re[n] * imag[delay + n] - im[n] * real[delay + n]
-            out[delay, block] = complex(same, cross)
-    return out

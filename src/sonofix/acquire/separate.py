@@ -29,8 +29,9 @@ STANDS_OUT = 10 ** (3 / 10)
 HIGH = 4.0
 """Times the threshold: more than the highest of the forest of peaks that cross-talk makes."""
 
-NEAR_STRONGEST = 10 ** (-12 / 10)
-"""Accepted beside the strongest, unless it stands out by ``ALONE``: codes may resemble each other at one lag."""
+CROSS_TALK = 30.0
+"""Times the mean cross-talk of a burst, which is one over its product of length and width: what lies below, beside the
+strongest, must stand out by ``ALONE``."""
 
 ALONE = 10 ** (6 / 10)
 
@@ -42,6 +43,18 @@ PATH_POWER = 10 ** (-12 / 10)
 
 UNEXPLAINED = 1.3
 """Power left while bursts sound, over that of their quiet margins, at which there must be more to find."""
+
+MATCHED = 10 ** (-4 / 10)
+"""Of a burst's energy: what its signature alone must explain."""
+
+FLANK = 0.5
+"""Of the shortest time a burst resolves: farther from the highest peak, a burst is on its flank."""
+
+CLEARED = 0.5
+"""Times the threshold: what was clear when found must keep of it when all else is taken away."""
+
+COLLAPSED = 0.1
+"""Of the shortest time a burst resolves: paths this close, and alike in velocity, cannot be told apart."""
 
 ECHO_POWER = 10 ** (-26 / 10)
 """Weaker echoes than this share of a burst's strongest path are not looked for."""
@@ -57,9 +70,9 @@ IMPULSE_SHARE = 0.15
 MOST_PATHS = 12
 """Of one burst."""
 
-ROUGH_ITERATIONS = 2
+CROWD_ITERATIONS = 2
 FULL_ITERATIONS = 12
-"""Of the joint refinement while paths are still being found, and when all are."""
+"""Of the joint refinement while echoes are still being found, and when all are."""
 
 
 @dataclass(slots=True, eq=False)
@@ -67,18 +80,20 @@ class Sound:
     """One path of one emitter's burst, as it was found.
 
     ``power`` is its correlation power then, ``clear`` whether that stood out and above the threshold at once; if not,
-    it must stand ``threshold`` times above the noise when all else is taken away.
+    it must stand ``threshold`` times above the noise when all else is taken away. ``sought`` marks what was found by
+    looking only where it was predicted: the flank of another peak may have passed for it.
     """
 
     bank: Bank
     power: float
     threshold: float
     clear: bool
+    sought: bool
 
 
-Deed = Literal["taken", "aside", "unpredicted", "weak", "alike"]
-"""Paths were taken, or impulses set aside; or no burst came as predicted; or paths are to be dropped because they do
-not stand above the noise, or no higher than other peaks of their search."""
+Deed = Literal["taken", "aside", "unpredicted", "merged", "weak", "alike"]
+"""Paths were taken, or impulses set aside; or no burst came as predicted; or paths are to be dropped because they fell
+onto others, do not stand above the noise, or no higher than other peaks of their search."""
 
 Watch = Callable[["Separation", Deed, Sequence[int]], None]
 """Is told what was done, or is about to be, and to which of the ``sounds``, by index."""
@@ -137,13 +152,19 @@ class Separation:
         if not self.banks:
             return
         self._predictions = predictions
-        self._take_beacons(predictions)
-        if predictions and not self.sounds:
-            self._predictions = {}
+        self._take_apart()
+        if predictions and not any(self._awaited(i) for i in range(len(self.sounds))):
+            # nothing came as predicted: then the prediction is what is wrong
             self._tell("unpredicted", ())
-            self._take_beacons({})
+            self._keep([])
+            self._predictions = {}
+            self._take_apart()
+
+    def _take_apart(self) -> None:
+        self._take_beacons(self._predictions)
         self._settle()
         if self._disturbed():
+            self._straighten()
             self._leave_out_impulses()
             self._take_crowd()
         elif self._prune():
@@ -152,6 +173,14 @@ class Separation:
         self._prune()
         if self._disturbed():
             self._verify()
+
+    def _straighten(self) -> None:
+        """Give bursts the curvature that explains them, loudest first: what a poor fit of one leaves disturbs all."""
+        if any(
+            [self.joint.straighten(int(i)) for i in np.argsort([-self._energy(i) for i in range(len(self.sounds))])]
+        ):
+            self._settled = False
+            self._settle()
 
     def _leave_out_impulses(self) -> None:
         """Set aside clicks and drop-outs: what is far above the rest of what is left, for far shorter than a burst."""
@@ -187,10 +216,21 @@ class Separation:
                 self._keep([i for i in range(len(self.sounds)) if i not in dropped])
                 self._prune()
 
+    def _sure(self, i: int, noise: float) -> bool:
+        """Whether a burst stands above the noise left around it, or out of a search."""
+        sound = self.sounds[i]
+        if self.joint.matched(i) < MATCHED * self._energy(i):
+            return False
+        above = self._energy(i) / (sound.threshold * noise)
+        if sound.clear and above > CLEARED:
+            return True
+        return (above > 1.0 and not sound.sought) or self._stands_out(i)
+
     def _stands_out(self, i: int) -> bool:
         """Whether a burst stands out of a search of its code in what all other bursts leave.
 
         Cross-talk makes a forest of peaks, none far above the mean; a path may have echoes as strong, but stands high.
+        What was found near a prediction must be the highest of all.
         """
         bank = self.sounds[i].bank
         known_s = [self._begins_s(k) for k, s in enumerate(self.sounds) if s.bank is bank and k != i]
@@ -199,7 +239,21 @@ class Separation:
         if peak is None:
             return False
         energy, floor = self._energy(i), peak.threshold * peak.noise
+        if self.sounds[i].sought and abs(peak.start_s - self._begins_s(i)) > FLANK / self.band.half_width_hz:
+            return False
         return energy > floor and (energy > STANDS_OUT * peak.second or energy > HIGH * floor)
+
+    def _collapsed(self, i: int) -> bool:
+        """Whether a burst fell onto an earlier found path of its emitter, so that only their sum means anything."""
+        burst = self.joint.bursts[i]
+        near_s = COLLAPSED / self.band.half_width_hz
+        slow = 1.0 / (np.pi * burst.waveform.carrier_hz * burst.waveform.duration_s)
+        return any(
+            s.bank is self.sounds[i].bank
+            and abs(self.joint.bursts[k].arrival_s - burst.arrival_s) < near_s
+            and abs(self.joint.bursts[k].beta - burst.beta) < slow
+            for k, s in enumerate(self.sounds[:i])
+        )
 
     def _tell(self, deed: Deed, which: Sequence[int]) -> None:
         if self._watch is not None:
@@ -227,7 +281,8 @@ class Separation:
                 (bank, peak)
                 for bank, peak in found
                 if (peak.power > peak.threshold * peak.noise or not predictions)
-                and peak.power > (STANDS_OUT if peak.power >= NEAR_STRONGEST * strongest else ALONE) * peak.second
+                and peak.power
+                > (STANDS_OUT if peak.power > self._cross_talk(bank) * strongest else ALONE) * peak.second
             ]
             if not sure:
                 # a prediction leaves little room for anything else; without, the loudest of a crowd may be an echo
@@ -238,6 +293,10 @@ class Separation:
             if not predictions:
                 accepted = {bank.emitter for bank, _ in sure}
                 before = [(bank, peak) for bank, peak in found if bank.emitter not in accepted]
+
+    def _cross_talk(self, bank: Bank) -> float:
+        """Correlation power that another burst as loud may have with this one's code."""
+        return CROSS_TALK / (2 * self.band.half_width_hz * bank.waveform.duration_s)
 
     def _stays(self, bank: Bank, old: Peak) -> Peak | None:
         """Look where an emitter's highest peak was before louder bursts were taken away; None if it went with them."""
@@ -274,7 +333,7 @@ class Separation:
                 fresh.add(bank.emitter)
             peak = last[bank.emitter]
             assert peak is not None
-            self._accept([(bank, peak)])
+            self._accept([(bank, peak)], CROWD_ITERATIONS)
 
     def _look(self, bank: Bank, predictions: Mapping[str, Prediction], echoes: bool = False) -> Peak | None:
         """Search one emitter in what is left; None where nothing is worth trying."""
@@ -310,22 +369,24 @@ class Separation:
             return None
         return peak if peak.power > ECHO_POWER * max((self.sounds[i].power for i in own), default=0.0) else None
 
-    def _accept(self, found: list[tuple[Bank, Peak]]) -> None:
+    def _accept(self, found: list[tuple[Bank, Peak]], iterations: int = 1) -> None:
         for bank, peak in found:
             middle_s = peak.start_s + bank.waveform.duration_s / 2
             self.joint.add(Burst(bank.waveform, middle_s, peak.range_rate_mps / self.sound_speed_mps, 0.0, 0j))
             clear = peak.power > peak.threshold * peak.noise and peak.power > STANDS_OUT * peak.second
-            self.sounds.append(Sound(bank, peak.power, peak.threshold, clear))
+            sought = bank.emitter in self._predictions and not clear
+            self.sounds.append(Sound(bank, peak.power, peak.threshold, clear, sought))
         self._settled = False
-        self._settle(rough=True)
+        self._settle(iterations)
         self._tell("taken", range(len(self.sounds) - len(found), len(self.sounds)))
 
-    def _settle(self, rough: bool = False) -> None:
+    def _settle(self, iterations: int = FULL_ITERATIONS) -> None:
         """Refine all paths together, then the tones in what they leave."""
         if self._settled:
             return
-        self.joint.settle(*((ROUGH_ITERATIONS, STALE_RAD) if rough else (FULL_ITERATIONS, FRESH_RAD)))
-        self._settled = not rough
+        full = iterations == FULL_ITERATIONS
+        self.joint.settle(iterations, FRESH_RAD if full else STALE_RAD)
+        self._settled = full
         if self.tones:
             self.tones = refit(self.tones, self.joint.residual + self._tone(), self.band.rate_hz)
             self.joint.replace_baseband(self.baseband - self._tone())
@@ -335,13 +396,13 @@ class Separation:
         before = len(self.sounds)
         while self.sounds:
             self._settle()
+            merged = [i for i in range(len(self.sounds)) if self._collapsed(i)]
+            if merged:
+                self._tell("merged", merged)
+                self._keep([i for i in range(len(self.sounds)) if i not in merged])
+                continue
             noise = self.joint.noise()
-            energy = np.array([self._energy(i) for i in range(len(self.sounds))])
-            sure = [
-                i
-                for i, s in enumerate(self.sounds)
-                if s.clear or energy[i] > s.threshold * noise[i] or self._stands_out(i)
-            ]
+            sure = [i for i, power in enumerate(noise) if self._sure(i, float(power))]
             if len(sure) == len(self.sounds):
                 break
             self._tell("weak", sorted(set(range(len(self.sounds))) - set(sure)))
@@ -416,8 +477,8 @@ class Separation:
                 for i, b in enumerate(self.joint.bursts)
             )
             first = max(0, int((begins_s - self.start_s) * self.band.rate_hz))
-            last = int((ends_s - self.start_s) * self.band.rate_hz) + 1
-        left = self.joint.residual[first:last]
+            last = max(first, int((ends_s - self.start_s) * self.band.rate_hz) + 1)
+        left = self.joint.residual[first:last][self.joint.counted[first:last]]
         return bool(len(left)) and float(np.mean(np.abs(left) ** 2)) > UNEXPLAINED * self._floor
 
     def _whole(self, i: int) -> bool:

@@ -55,7 +55,7 @@ def find_tones(baseband: Complexes, rate_hz: float) -> list[Tone]:
     size = int(scipy.fft.next_fast_len(2 * len(window)) or 0)
     for _ in range(MOST_TONES):
         heard = left[stretch]
-        spectrum = np.abs(scipy.fft.fft((heard * window).astype(np.complex64), size)) ** 2
+        spectrum = np.abs(np.asarray(scipy.fft.fft((heard * window).astype(np.complex64), size))) ** 2
         peak = int(np.argmax(spectrum))
         if spectrum[peak] < STANDS_OUT * np.median(spectrum):
             break

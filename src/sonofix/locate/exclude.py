@@ -15,6 +15,9 @@ FALSE_ALARM = 1e-5
 MOST_PAIRS = 66
 """Pairs of rows tried as both faulty: all of twelve rows."""
 
+MOST_ANEW = 12
+"""Choices that are solved from new starts where no descent from the faulty fix mends it."""
+
 APART_SIGMA = 6.0
 """Two selections that both pass the test but put the vehicle this far apart leave the fault undecided."""
 
@@ -40,7 +43,15 @@ def exclude(
             break
         choices = _leaving(rows, count)
         place_m, chi2, deviation_m = solver.without(choices, found[0])
-        passing = [i for i in np.argsort(chi2, kind="stable") if agrees(solver, len(rows) - count, float(chi2[i]))]
+        order = np.argsort(chi2, kind="stable")
+        if not agrees(solver, len(rows) - count, float(chi2[order[0]])):
+            # a descent from where the faulty row drew the fix may end in a wrong valley: begin anew without it
+            for i in order[:MOST_ANEW]:
+                anew = solver.candidates(choices[i])
+                if anew and anew[0].chi2 < chi2[i]:
+                    chi2[i], place_m[i] = anew[0].chi2, anew[0].position_m
+            order = np.argsort(chi2, kind="stable")
+        passing = [i for i in order if agrees(solver, len(rows) - count, float(chi2[i]))]
         if passing:
             best = passing[0]
             again = solver.candidates(choices[best])
