@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import Phase, settings
 
-# The same examples in every run, however slow the machine; one that fails is told as it is, without minutes of shrinking.
+# The same examples in every run, however slow the machine; one that fails is told as it is, not shrunk for minutes.
 settings.register_profile("sonofix", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
 settings.load_profile("sonofix")
 

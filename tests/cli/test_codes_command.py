@@ -133,7 +133,7 @@ def test_chips_of_a_file_are_chosen_from(tmp_path):
         (["--count", "1"], "--count 1: codes are chosen by their pairs; ask for 2 or more"),
         (["--count", "19", "--degree", "7", "--family", "m-sequence"], "degree 7 of m-sequence has 18 codes; ask for"),
         (["--degree", "8", "--family", "gold"], "--degree 8: has no Gold codes here; valid is 3, 5, 6, 7"),
-        (["--degree", "30"], "--degree 30: a site file takes m-sequences of degree 2 to 16"),
+        (["--degree", "30"], "--degree 30: codes are compared up to degree 11"),
         (["--family", "golden"], "--family golden: families are m-sequence, gold, kasami"),
         (["--reach", "0"], "--reach 0: it must be above 0, in m, or inf"),
         (["--max-speed", "-1"], "--max-speed -1: it must be from 0 to 15, in m/s"),

@@ -64,7 +64,7 @@ def test_all_gold_and_kasami_codes_are_listed_as_numbered():
     [
         (8, ("gold",), "no Gold codes"),
         (7, ("kasami",), "no Kasami codes"),
-        (17, ("m-sequence", "gold", "kasami"), "degree 2 to 16"),
+        (17, ("m-sequence", "gold", "kasami"), "up to degree 11"),
         (1, ("m-sequence",), "from 2 to 20"),
         (7, ("golden",), "families are m-sequence, gold, kasami"),
         (7, (), "families is empty"),

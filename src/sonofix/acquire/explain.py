@@ -262,7 +262,7 @@ def _paths(
     job: Separation,
     hearing: Hearing,
     which: Sequence[int],
-    deed: Literal["weak", "alike"] | None,
+    deed: Literal["merged", "weak", "alike"] | None,
     detection: Detection | None = None,
 ) -> list[PathInsight]:
     """Tell of some of the paths: as they are, or as they are about to be dropped for a reason."""
@@ -274,7 +274,9 @@ def _paths(
         sound, burst = job.sounds[i], joint.bursts[i]
         over = job._energy(i) / noise[i]
         dropped = ""
-        if deed == "weak":
+        if deed == "merged":
+            dropped = "fell onto another path of its beacon"
+        elif deed == "weak":
             over_db, asked_db = 10 * np.log10(max(over, 1e-30)), 10 * np.log10(sound.threshold)
             dropped = f"stands {over_db:.1f} dB over the noise; {asked_db:.1f} dB are asked"
         elif deed == "alike":

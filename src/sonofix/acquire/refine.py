@@ -42,7 +42,7 @@ BEND_STEP_RAD = 1.2
 MOST_BEND_RAD = 24.0
 """What steps and limits of curvature turn a burst's end by, against its middle."""
 
-MUCH_MORE = 1.15
+MUCH_MORE = 1.6
 """Power explained, over that of the present fit, at which another curvature is taken."""
 
 ROUNDING = 1e-6

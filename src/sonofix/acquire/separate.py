@@ -224,13 +224,14 @@ class Separation:
         above = self._energy(i) / (sound.threshold * noise)
         if sound.clear and above > CLEARED:
             return True
-        return (above > 1.0 and not sound.sought) or self._stands_out(i)
+        # among echoes the direct path need not be the highest of all
+        return (above > 1.0 and (not sound.sought or self._disturbed())) or self._stands_out(i)
 
     def _stands_out(self, i: int) -> bool:
         """Whether a burst stands out of a search of its code in what all other bursts leave.
 
         Cross-talk makes a forest of peaks, none far above the mean; a path may have echoes as strong, but stands high.
-        What was found near a prediction must be the highest of all.
+        What was found near a prediction must be the highest of all, unless there are echoes.
         """
         bank = self.sounds[i].bank
         known_s = [self._begins_s(k) for k, s in enumerate(self.sounds) if s.bank is bank and k != i]
@@ -239,7 +240,11 @@ class Separation:
         if peak is None:
             return False
         energy, floor = self._energy(i), peak.threshold * peak.noise
-        if self.sounds[i].sought and abs(peak.start_s - self._begins_s(i)) > FLANK / self.band.half_width_hz:
+        if (
+            self.sounds[i].sought
+            and not self._disturbed()
+            and abs(peak.start_s - self._begins_s(i)) > FLANK / self.band.half_width_hz
+        ):
             return False
         return energy > floor and (energy > STANDS_OUT * peak.second or energy > HIGH * floor)
 

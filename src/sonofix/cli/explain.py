@@ -72,8 +72,9 @@ def explain(
     stem = f"epoch-{epoch}-{safe_name(seen.microphone)}"
     try:
         _write_paths(out / f"{stem}-paths.csv", seen)
-        for old in out.glob(f"{stem}-*.png"):
-            old.unlink()
+        for kind in ("overview", "beacons"):
+            for old in (*out.glob(f"{stem}-{kind}*.png"), *out.glob(f"{stem}-*kHz-{kind}*.png")):
+                old.unlink()
         if plot:
             _draw(out, stem, seen, site.name)
     except KeyboardInterrupt:

@@ -84,21 +84,30 @@ class CodeSet:
         return float(self.level_db[self.worst_pair])
 
 
+MOST_DEGREE = 11
+"""Of families compared code by code."""
+
+
 def family_candidates(degree: int, families: Sequence[str] = FAMILIES) -> list[Candidate]:
     """List every code of a degree in the named families; chips that two families share are listed once.
 
     Parameters
     ----------
     degree : int
-        2 … 16.
+        2 … ``MOST_DEGREE``: bursts of 2047 chips last half a second, and there are two thousand of them.
     families : sequence of "m-sequence", "gold", "kasami"
         Several: those that have the degree.
 
     Raises
     ------
     ValueError
-        A family is unknown, or none of them has codes of this degree.
+        A family is unknown, none of them has codes of this degree, or there are too many to compare.
     """
+    if degree > MOST_DEGREE:
+        raise ValueError(
+            f"degree = {degree}; codes are compared up to degree {MOST_DEGREE}, beyond there are too many: give a "
+            "smaller degree, or some chips"
+        )
     makers: dict[str, Callable[[int], list[Candidate]]] = {"m-sequence": _m_sequences, "gold": _gold, "kasami": _kasami}
     found: dict[bytes, Candidate] = {}
     problems = []
