@@ -40,7 +40,7 @@ def rendered(w: Waveform, arrival_s: float, rate_mps: float, gain: complex) -> N
 
 def heard(plan: Plan, samples: NDArray[np.float32], first: int = 0) -> Detection:
     begins = first / RATE_HZ
-    found, _ = acquire(plan, samples, first, "M", {"A": (begins, begins + 0.08)})
+    found, _ = acquire(plan, samples, first, "M", {"A": (begins, begins + 0.09)})
     assert len(found) == 1
     return found[0]
 
