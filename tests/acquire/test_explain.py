@@ -77,7 +77,7 @@ def test_surface_is_the_correlation_with_every_replica(rng: np.random.Generator)
     band, banks = PLAN.bands[0]
     bank = banks[0]
     baseband, start_s = downconvert(heard(MIXED, 1e-3, rng), 0, band)
-    begins_s, power = surface(baseband, start_s, bank, band.rate_hz, 0.01, 0.05)
+    begins_s, power = surface(baseband, start_s, bank, band, 0.01, 0.05)
     assert power.shape == (len(bank.replicas), len(begins_s))
     length = bank.replicas.shape[1]
     first = round((begins_s[0] - bank.lead_s - start_s) * band.rate_hz)

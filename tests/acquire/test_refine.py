@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sonofix.acquire.baseband import band_limited, design_band
-from sonofix.acquire.kernels import add_model, assemble, columns
-from sonofix.acquire.refine import Burst, Joint, refine
+from sonofix.acquire.kernels import add_model, assemble, bent, columns
+from sonofix.acquire.refine import FRESH_RAD, Burst, Joint
 from sonofix.records import Floats
 from sonofix.signals import codes
 from sonofix.signals.interpolate import sample
@@ -52,6 +52,18 @@ def filled(burst: Burst) -> tuple[NDArray[np.complex128], NDArray[np.float32], t
     parts = np.zeros((4, 2, COUNT), np.float32)
     support = columns(*fixed(burst), burst.arrival_s, burst.beta, burst.kappa, parts)
     return parts[:, 0].astype(np.complex128) + 1j * parts[:, 1], parts, support
+
+
+def refine(
+    heard: NDArray[np.complex128], starts: list[Burst], kappa_sd: float, whiteness: float, iterations: int
+) -> tuple[list[Burst], list[Floats], NDArray[np.complex128], Floats]:
+    """Fit bursts from starting values, all at once: bursts, covariances, what they leave, noise."""
+    joint = Joint(heard, START_S, RATE_HZ, kappa_sd, whiteness)
+    for burst in starts:
+        joint.add(burst)
+    joint.settle(iterations, FRESH_RAD)
+    noise = joint.noise()
+    return joint.bursts, joint.covariances(noise), joint.residual, noise
 
 
 BURSTS = (
@@ -122,6 +134,39 @@ def test_residual_is_what_bursts_leave(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(joint.residual, left + 0.5, atol=1e-6)
 
 
+def test_power_explained_is_that_of_the_plain_model(rng: np.random.Generator) -> None:
+    heard = model(BURSTS[0]) + noisy(rng, 1e-2)
+    betas, kappas = BURSTS[0].beta + np.array([-2e-4, 0.0, 3e-4]), np.array([-0.01, BURSTS[0].kappa])
+    power = bent(heard, *fixed(BURSTS[0]), BURSTS[0].arrival_s, betas, kappas)
+    for i, kappa in enumerate(kappas):
+        for j, beta in enumerate(betas):
+            plain = model(replace(BURSTS[0], beta=float(beta), kappa=float(kappa), gain=1.0))
+            expected = np.abs(np.vdot(plain, heard)) ** 2 / np.vdot(plain, plain).real
+            assert power[i, j] == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_curvature_far_off_is_found(rng: np.random.Generator) -> None:
+    """Bent by three deviations of what is expected, which a descent from a straight line does not reach."""
+    kappa_sd = 0.15
+    heard = model(replace(BURSTS[0], kappa=0.45, gain=0.5)) + noisy(rng, 1e-4)
+    joint = Joint(heard, START_S, RATE_HZ, kappa_sd, 1.0)
+    joint.add(replace(BURSTS[0], kappa=0.0, gain=0j))
+    assert joint.straighten(0)
+    joint.settle(20)
+    assert joint.bursts[0].kappa == pytest.approx(0.45, abs=0.02)
+    assert np.mean(np.abs(joint.residual) ** 2) == pytest.approx(1e-4, rel=0.2)
+    assert not joint.straighten(0)
+
+
+def test_a_burst_matches_its_signature_and_a_bare_carrier_does_not(rng: np.random.Generator) -> None:
+    for heard, share in ((model(BURSTS[0]), 1.0), (0.5 * np.ones(COUNT, complex), 0.0)):
+        joint = Joint(heard + noisy(rng, 1e-6), START_S, RATE_HZ, KAPPA_SD, 1.0)
+        joint.add(replace(BURSTS[0], beta=0.0 if share == 0.0 else BURSTS[0].beta))
+        w = BURSTS[0].waveform
+        energy = abs(joint.bursts[0].gain) ** 2 * np.sum(np.abs(w.signature) ** 2) * RATE_HZ / w.rate_hz
+        assert joint.matched(0) / energy == pytest.approx(share, abs=0.05)
+
+
 def test_nothing_sounds_outside_the_table() -> None:
     assert not columns_of(replace(BURSTS[0], arrival_s=START_S + 9.0)).any()
 
@@ -130,8 +175,8 @@ def settled(
     heard: NDArray[np.complex128], starts: list[Burst], whiteness: float = 1.0, kappa_sd: float = KAPPA_SD
 ) -> tuple[list[Burst], list[Floats], NDArray[np.complexfloating], Floats]:
     """Roughly, then fully: the weight of κ's prior follows from what remains when a refinement begins."""
-    rough = refine(heard, START_S, RATE_HZ, starts, kappa_sd, whiteness, 8)[0]
-    return refine(heard, START_S, RATE_HZ, rough, kappa_sd, whiteness, 20)
+    rough = refine(heard, starts, kappa_sd, whiteness, 8)[0]
+    return refine(heard, rough, kappa_sd, whiteness, 20)
 
 
 def off(burst: Burst, rng: np.random.Generator) -> Burst:
@@ -225,5 +270,5 @@ def test_misfit_never_grows(rng: np.random.Generator) -> None:
             replace(b, arrival_s=b.arrival_s + rng.normal(0, 1e-3), beta=b.beta + rng.normal(0, 3e-3))
             for b in (BURSTS[0], BURSTS[2])
         ]
-        before, after = (refine(heard, START_S, RATE_HZ, start, 1e3, 1.0, n)[2] for n in (0, 12))
+        before, after = (refine(heard, start, 1e3, 1.0, n)[2] for n in (0, 12))
         assert np.linalg.norm(after) <= np.linalg.norm(before) * (1 + 1e-9)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.acquire.clicks import runs
 from sonofix.records import Floats
 from sonofix.site import Site
 
@@ -134,7 +135,7 @@ def screen(samples: NDArray[np.float32], rate_hz: float) -> tuple[NDArray[np.flo
     if loudest == 0.0:
         flags.append("no sound at all: every sample is 0")
     else:
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], samples == 0.0, [False]]))).reshape(-1, 2)
+        edges = runs(samples == 0.0)
         lengths = np.diff(edges, axis=1)[:, 0][(edges[:, 0] > 0) & (edges[:, 1] < samples.size)]
         missing = lengths[lengths > DROP_OUT_S * rate_hz]
         if len(missing):

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank
+from sonofix.acquire.baseband import Band
 from sonofix.acquire.plan import Plan, taken_apart
-from sonofix.acquire.search import search
+from sonofix.acquire.search import correlations, delays, search
 from sonofix.acquire.separate import Deed, Separation
 from sonofix.acquire.spectrum import DEPTH, decibels, density_of, power_of, recorded, smoothed_db
 from sonofix.records import BandInsight, BeaconInsight, Detection, Floats, Insight, PathInsight, Prediction, Stage
@@ -137,13 +138,12 @@ def _band(job: Separation, hearing: Hearing, diary: _Diary, detections: Mapping[
     clean = heard - sum((tone.course for tone in job.tones), np.zeros_like(heard))
     left = job.joint.residual
     first, last = recorded(heard)
-    # what was set aside is exactly 0 in what is left, and nothing else is
-    aside = (left == 0) & (np.arange(len(left)) >= first) & (np.arange(len(left)) < last)
+    aside = ~job.joint.counted
     kept = np.where(aside, 0.0, clean)
     offset_hz, heard_density = density_of(heard[first:last], band.rate_hz)
     inside = np.abs(offset_hz) <= band.half_width_hz
     densities = [heard_density] + [density_of(x[first:last], band.rate_hz)[1] for x in (kept, left)]
-    floor = job._floor
+    floor = job.floor
     unit = floor if floor > 0 else max(float(np.mean(power_of(left))), 1e-30)
     quiet = decibels(np.array([floor * band.whiteness / band.rate_hz / 2]))[0] if floor > 0 else None
     return BandInsight(
@@ -169,12 +169,7 @@ def _band(job: Separation, hearing: Hearing, diary: _Diary, detections: Mapping[
 
 def _stages(job: Separation, diary: _Diary, clean: NDArray[np.complex128], unit: float) -> tuple[Stage, ...]:
     """Mean power left after each stage, over the stretch in which any burst of the final model sounds."""
-    first, last = 0, len(clean)
-    if job.sounds:
-        begins_s = min(job._begins_s(i) for i in range(len(job.sounds)))
-        ends_s = max(b.arrival_s + b.waveform.duration_s / 2 for b in job.joint.bursts)
-        first = max(0, int((begins_s - job.start_s) * job.band.rate_hz))
-        last = min(last, int((ends_s - job.start_s) * job.band.rate_hz) + 1)
+    first, last = job.sounding()
     entries: list[tuple[str, tuple[str, ...], Floats | None]] = [("as heard", (), power_of(job.baseband))]
     if job.tones:
         entries.append(("tones", (), power_of(clean)))
@@ -195,8 +190,8 @@ def _beacon(
     own = [i for i, s in enumerate(job.sounds) if s.bank is bank]
     alone = joint.residual + sum((joint.residual_with(i) - joint.residual for i in own), np.zeros_like(joint.residual))
     opens_s, closes_s = hearing.windows[emitter]
-    at_s, alone_power = surface(alone, job.start_s, bank, job.band.rate_hz, opens_s, closes_s)
-    _, heard_power = surface(job.baseband, job.start_s, bank, job.band.rate_hz, opens_s, closes_s)
+    at_s, alone_power = surface(alone, job.start_s, bank, job.band, opens_s, closes_s)
+    _, heard_power = surface(job.baseband, job.start_s, bank, job.band, opens_s, closes_s)
     if own:
         reported = [i for i in own if detection is not None and joint.bursts[i].arrival_s == detection.arrival_s]
         noise, threshold = float(joint.noise()[(reported or own)[0]]), job.sounds[own[0]].threshold
@@ -219,7 +214,7 @@ def _beacon(
 
 
 def surface(
-    baseband: NDArray[np.complex128], start_s: float, bank: Bank, rate_hz: float, opens_s: float, closes_s: float
+    baseband: NDArray[np.complex128], start_s: float, bank: Bank, band: Band, opens_s: float, closes_s: float
 ) -> tuple[Floats, NDArray[np.float32]]:
     """Correlation power of a bank's replicas with samples, for bursts that begin within [opens_s, closes_s].
 
@@ -227,31 +222,27 @@ def surface(
     -------
     begins_s : float64 (d,)
     power : float32 (m, d)
-        A row a replica, as `search` computes and `search.profile` boils down.
+        A row a replica, as `search.profile` boils it down.
     """
-    import scipy.fft
-
-    first = max(0, int(np.floor((opens_s - bank.lead_s - start_s) * rate_hz)))
-    last = min(len(baseband) - 1, int(np.ceil((closes_s - bank.lead_s - start_s) * rate_hz)))
-    count = max(0, last - first + 1)
-    begins_s = start_s + (first + np.arange(count)) / rate_hz + bank.lead_s
-    if not count:
-        return begins_s, np.zeros((len(bank.replicas), 0), np.float32)
-    length = bank.length(count)
-    stretch = baseband[first : first + count - 1 + bank.replicas.shape[1]].astype(np.complex64)
-    product = bank.spectra(length) * np.asarray(scipy.fft.fft(stretch, length))
-    plane = np.asarray(scipy.fft.ifft(product, axis=-1, overwrite_x=True), np.complex64)[:, :count]
-    return begins_s, plane.real**2 + plane.imag**2
+    first, count = delays(baseband, start_s, bank, band, opens_s, closes_s)
+    count = max(0, count)
+    begins_s = start_s + (first + np.arange(count)) / band.rate_hz + bank.lead_s
+    power = np.zeros((len(bank.replicas), count), np.float32)
+    if count:
+        stretch = baseband[first : first + count - 1 + bank.replicas.shape[1]]
+        for low, part in correlations(stretch, bank, count):
+            power[low : low + len(part)] = part.real**2 + part.imag**2
+    return begins_s, power
 
 
 def _predicted(job: Separation, hearing: Hearing, bank: Bank) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Ways and range rates that a warm search looks through."""
-    expected = job._predictions.get(bank.emitter)
+    expected = job.predictions.get(bank.emitter)
     if expected is None:
         return None
     c = hearing.plan.sound_speed_mps
     way_m = c * (expected.arrival_s - bank.waveform.duration_s / 2 - hearing.sent_s[bank.emitter])
-    reach_m, reach_mps = c * job._reach_s(expected), 5 * expected.range_rate_sd_mps
+    reach_m, reach_mps = c * job.reach_s(expected), 5 * expected.range_rate_sd_mps
     return (
         (float(way_m - reach_m), float(way_m + reach_m)),
         (expected.range_rate_mps - reach_mps, expected.range_rate_mps + reach_mps),
@@ -272,7 +263,7 @@ def _paths(
     out = []
     for i in which:
         sound, burst = job.sounds[i], joint.bursts[i]
-        over = job._energy(i) / noise[i]
+        over = job.energy(i) / noise[i]
         dropped = ""
         if deed == "merged":
             dropped = "fell onto another path of its beacon"
@@ -284,7 +275,7 @@ def _paths(
         sd_s, sd_beta = (None, None) if covariances is None else np.sqrt(np.diag(covariances[i]))
         out.append(
             PathInsight(
-                range_m=c * (job._begins_s(i) - hearing.sent_s[sound.bank.emitter]),
+                range_m=c * (job.begins_s(i) - hearing.sent_s[sound.bank.emitter]),
                 range_sd_m=None if sd_s is None else float(c * sd_s),
                 range_rate_mps=c * burst.beta,
                 range_rate_sd_mps=None if sd_beta is None else float(c * sd_beta),
@@ -302,7 +293,7 @@ def _verdict(
 ) -> str:
     """Say in a few words why a beacon has no range."""
     if own:
-        if not any(job._awaited(i) for i in own):
+        if not any(job.awaited(i) for i in own):
             return "came, but not when its direct sound was due: an echo, it seems"
         return "cut off where the recording begins or ends"
     if dropped:

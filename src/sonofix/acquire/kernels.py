@@ -18,7 +18,7 @@ def _sounding(size, table_rate_hz, table_start_s, half_s, start_s, rate_hz, coun
     """First and past-the-last sample at which a burst's own time lies inside its table (monotonic: |β| ≪ 1)."""
     low = table_start_s + 1.0 / table_rate_hz - half_s
     high = table_start_s + (size - 3.0) / table_rate_hz - half_s
-    # u − β u − κ/2 u² = edge, by two rounds of substitution; κ u ≪ 1
+    # u − β u − κ/2 u² = edge, by three rounds of substitution; κ u ≪ 1
     u_low, u_high = low, high
     for _ in range(3):
         u_low = (low + 0.5 * kappa * u_low * u_low) / (1.0 - beta)
@@ -138,37 +138,29 @@ def bent(
 ) -> Floats:
     """Power (kappas, betas) that one burst's model explains of ``heard`` (n,) at each β and κ, its gain free."""
     out = np.zeros((kappas.shape[0], betas.shape[0]))
-    step_s = 1.0 / rate_hz
+    model = np.empty_like(heard)
     for i in range(kappas.shape[0]):
-        bend = _turned(carrier_hz, 0.0, 2.0 * kappas[i], step_s)
         for j in range(betas.shape[0]):
-            first, last = _sounding(
-                table.shape[0],
+            model[:] = 0.0
+            add_model(
+                model,
+                table,
                 table_rate_hz,
                 table_start_s,
                 half_s,
+                carrier_hz,
                 start_s,
                 rate_hz,
-                heard.shape[0],
                 arrival_s,
                 betas[j],
                 kappas[i],
+                1.0 + 0.0j,
             )
-            carrier = 1.0 + 0.0j
-            ahead = 1.0 + 0.0j
             seen = 0.0 + 0.0j
             energy = 1e-300
-            for n in range(first, last):
-                u = start_s + n / rate_hz - arrival_s
-                if (n - first) % RENEWED == 0:
-                    carrier = _turned(carrier_hz, betas[j], kappas[i], u)
-                    ahead = _turned(carrier_hz, betas[j], kappas[i], u + step_s) * np.conj(carrier)
-                tau = half_s + u - betas[j] * u - 0.5 * kappas[i] * u * u
-                model = read(table, (tau - table_start_s) * table_rate_hz) * carrier
-                seen += np.conj(model) * heard[n]
-                energy += model.real**2 + model.imag**2
-                carrier *= ahead
-                ahead *= bend
+            for n in range(heard.shape[0]):
+                seen += np.conj(model[n]) * heard[n]
+                energy += model[n].real ** 2 + model[n].imag ** 2
             out[i, j] = (seen.real**2 + seen.imag**2) / energy
     return out
 

@@ -111,12 +111,7 @@ class Joint:
         self._turn[i] = 2 * np.pi * rms_hz(burst.waveform), turn * half_s, turn * half_s**2 / 2
         self.bursts.append(burst)
         self._renew(i)
-        energy = self._products[4 * i, 4 * i].real
-        seen = self._seen(i, i + 1)[0, 0]
-        gain = complex(seen / energy) if energy > 0 else 0j
-        self.bursts[i] = replace(burst, gain=gain)
-        self._subtract(self.residual, self.bursts[i])
-        self.residual[self._left_out] = 0.0
+        self._solve_gain(i)
 
     def keep(self, which: list[int]) -> None:
         """Drop all bursts but these; `settle` what is left."""
@@ -185,11 +180,10 @@ class Joint:
             if settled:
                 break
 
-    def residual_with(self, i: int) -> NDArray[np.complex128]:
+    def residual_with(self, i: int) -> Complexes:
         """What all bursts but one leave (n,)."""
         out = self.residual.copy()
         self._subtract(out, replace(self.bursts[i], gain=-self.bursts[i].gain))
-        out[self._left_out] = 0.0
         return out
 
     def straighten(self, i: int) -> bool:
@@ -199,30 +193,22 @@ class Joint:
         that began on one ends in a side valley.
         """
         burst = self.bursts[i]
-        w = burst.waveform
-        half_s, turn = w.duration_s / 2, 2 * np.pi * w.carrier_hz
-        most = min(PLAUSIBLE * self._kappa_sd, MOST_BEND_RAD / (turn * half_s**2 / 2))
-        kappas = np.linspace(-most, most, 2 * int(np.ceil(most * turn * half_s**2 / 2 / BEND_STEP_RAD)) + 1)
+        _, by_beta, by_kappa = self._turn[i]
+        most = min(PLAUSIBLE * self._kappa_sd, MOST_BEND_RAD / by_kappa)
+        kappas = np.linspace(-most, most, 2 * int(np.ceil(most * by_kappa / BEND_STEP_RAD)) + 1)
         # a line along one half of a parabola is off by half the bend it leaves out
-        reach = most * half_s / 2
-        betas = burst.beta + np.linspace(-reach, reach, 2 * int(np.ceil(reach * turn * half_s / BEND_STEP_RAD)) + 1)
-        fixed = (w.envelope, w.rate_hz, w.start_s, half_s, w.carrier_hz, self._start_s, self._rate_hz)
-        heard = self.residual_with(i)
+        reach = most * burst.waveform.duration_s / 4
+        betas = burst.beta + np.linspace(-reach, reach, 2 * int(np.ceil(reach * by_beta / BEND_STEP_RAD)) + 1)
+        heard, fixed = self.residual_with(i), self._fixed(burst.waveform, burst.waveform.envelope)
         power = bent(heard, *fixed, burst.arrival_s, betas, kappas)
         k, b = np.unravel_index(int(np.argmax(power)), power.shape)
         now = bent(heard, *fixed, burst.arrival_s, np.array([burst.beta]), np.array([burst.kappa]))[0, 0]
         if not power[k, b] > MUCH_MORE * now:
             return False
-        bursts = list(self.bursts)
-        bursts[i] = replace(burst, beta=float(betas[b]), kappa=float(kappas[k]), gain=0j)
-        self.bursts = bursts
+        self.bursts[i] = replace(burst, beta=float(betas[b]), kappa=float(kappas[k]))
         self._renew(i)
         self.residual = heard
-        self.bursts[i] = replace(
-            bursts[i], gain=complex(self._seen(i, i + 1)[0, 0] / self._products[4 * i, 4 * i].real)
-        )
-        self._subtract(self.residual, self.bursts[i])
-        self.residual[self._left_out] = 0.0
+        self._solve_gain(i)
         return True
 
     def matched(self, i: int) -> float:
@@ -231,8 +217,7 @@ class Joint:
         That of a burst is its energy; a fit that took other bursts' carrier for its own has less.
         """
         burst = self.bursts[i]
-        w = burst.waveform
-        fixed = (w.signature, w.rate_hz, w.start_s, w.duration_s / 2, w.carrier_hz, self._start_s, self._rate_hz)
+        fixed = self._fixed(burst.waveform, burst.waveform.signature)
         bend = np.array([burst.beta]), np.array([burst.kappa])
         return float(bent(self.residual_with(i), *fixed, burst.arrival_s, *bend)[0, 0])
 
@@ -285,29 +270,27 @@ class Joint:
         right[:, 2:] = (np.conj(gain)[:, None] * seen[:, 1:]).real
         return right.ravel()
 
-    def _left(self, bursts: list[Burst]) -> NDArray[np.complex128]:
+    def _left(self, bursts: list[Burst]) -> Complexes:
         out = np.array(self._baseband, np.complex128)
-        for burst in bursts:
-            self._subtract(out, burst)
-        out[self._left_out] = 0.0
+        self._subtract(out, *bursts)
         return out
 
-    def _subtract(self, residual: Complexes, burst: Burst) -> None:
-        w = burst.waveform
-        add_model(
-            residual,
-            w.envelope,
-            w.rate_hz,
-            w.start_s,
-            w.duration_s / 2,
-            w.carrier_hz,
-            self._start_s,
-            self._rate_hz,
-            burst.arrival_s,
-            burst.beta,
-            burst.kappa,
-            -burst.gain,
-        )
+    def _solve_gain(self, i: int) -> None:
+        """Give burst i, which is not yet taken from what is left, the gain that fits it best; take it away."""
+        energy = self._products[4 * i, 4 * i].real
+        gain = complex(self._seen(i, i + 1)[0, 0] / energy) if energy > 0 else 0j
+        self.bursts[i] = replace(self.bursts[i], gain=gain)
+        self._subtract(self.residual, self.bursts[i])
+
+    def _subtract(self, residual: Complexes, *bursts: Burst) -> None:
+        for burst in bursts:
+            fixed = self._fixed(burst.waveform, burst.waveform.envelope)
+            add_model(residual, *fixed, burst.arrival_s, burst.beta, burst.kappa, -burst.gain)
+        residual[self._left_out] = 0.0
+
+    def _fixed(self, w: Waveform, table: Complexes) -> tuple[Complexes, float, float, float, float, float, float]:
+        """What the kernels ask of a burst and of the samples, whatever the burst does."""
+        return table, w.rate_hz, w.start_s, w.duration_s / 2, w.carrier_hz, self._start_s, self._rate_hz
 
     def _renew_stale(self, stale_rad: float) -> None:
         state = np.stack([b.state for b in self.bursts])
@@ -318,20 +301,8 @@ class Joint:
     def _renew(self, i: int) -> None:
         """Columns of burst i, and their products with all others'."""
         burst = self.bursts[i]
-        w = burst.waveform
-        self._support[i] = columns(
-            w.envelope,
-            w.rate_hz,
-            w.start_s,
-            w.duration_s / 2,
-            w.carrier_hz,
-            self._start_s,
-            self._rate_hz,
-            burst.arrival_s,
-            burst.beta,
-            burst.kappa,
-            self._columns[i],
-        )
+        fixed = self._fixed(burst.waveform, burst.waveform.envelope)
+        self._support[i] = columns(*fixed, burst.arrival_s, burst.beta, burst.kappa, self._columns[i])
         self._columns[i][..., self._left_out] = 0.0
         self._made[i] = burst.state
         first, last = self._support[i]
@@ -366,41 +337,6 @@ def rms_hz(waveform: Waveform) -> float:
     slope = np.diff(waveform.envelope) * waveform.rate_hz
     power = float(np.sum(np.abs(waveform.envelope) ** 2))
     return float(np.sqrt(np.sum(np.abs(slope) ** 2) / max(power, 1e-300)) / (2 * np.pi))
-
-
-def refine(
-    baseband: Complexes,
-    start_s: float,
-    rate_hz: float,
-    bursts: list[Burst],
-    kappa_sd: float,
-    whiteness: float,
-    iterations: int = 12,
-) -> tuple[list[Burst], list[Floats], Complexes, Floats]:
-    """Fit bursts to a stretch of base band, all at once, from the starting values given.
-
-    Parameters
-    ----------
-    baseband, start_s, rate_hz, kappa_sd, whiteness
-        As for `Joint`.
-    bursts : list of Burst
-        Starting values; gains are solved for.
-
-    Returns
-    -------
-    bursts : list of Burst
-    covariances : list of float64 (2, 2)
-        Of (arrival_s, β), marginal over all else.
-    residual : complex128 (n,)
-    noise : float64 (len(bursts),)
-        White-equivalent noise power per sample around each burst.
-    """
-    joint = Joint(baseband, start_s, rate_hz, kappa_sd, whiteness, max(1, len(bursts)))
-    for burst in bursts:
-        joint.add(burst)
-    joint.settle(iterations, FRESH_RAD)
-    noise = joint.noise()
-    return joint.bursts, joint.covariances(noise), joint.residual, noise
 
 
 def _inner(parts: NDArray[np.float32]) -> Complexes:

@@ -5,6 +5,7 @@ Cold: the whole plane, a row a velocity. Warm: few rows and delays round a predi
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numba
@@ -65,7 +66,7 @@ def search(
     baseband : complex128 (n,)
         First sample at ``start_s``.
     known_s : list of float
-        Starts of paths already found; what stands within a correlation peak of them is their remainder.
+        Starts of paths already found; what stands within ``REMAINDER`` of what a burst resolves is theirs.
     false_alarm_rate : float
         Probability that noise alone gives a detection in this search. Correlation power of noise is exponential, its
         mean is the median over ln 2, and the cells searched count as independent (they are fewer: conservative).
@@ -75,7 +76,7 @@ def search(
     Peak or None
         None where no sample of the interval lies within the base band.
     """
-    first, count = _delays(baseband, start_s, bank, band, opens_s, closes_s)
+    first, count = delays(baseband, start_s, bank, band, opens_s, closes_s)
     if count < 2:
         return None
     best, row, some = profile(baseband[first : first + count - 1 + bank.replicas.shape[1]], bank, count)
@@ -88,22 +89,32 @@ def profile(
     stretch: NDArray[np.complexfloating], bank: Bank, count: int, rows: slice = slice(None)
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
     """Highest correlation power over velocities at each of ``count`` delays, its row, and a sample of all cells."""
+    best = np.full(count, -1.0, np.float32)
+    row = np.zeros(count, np.int64)
+    some = np.empty((len(bank.range_rate_mps[rows]), (count - 1) // EVERY + 1), np.float32)
+    for low, part in correlations(stretch, bank, count, rows):
+        _highest(part, low, best, row, some)
+    return best, row, some
+
+
+def correlations(
+    stretch: NDArray[np.complexfloating], bank: Bank, count: int, rows: slice = slice(None)
+) -> Iterator[tuple[int, NDArray[np.complex64]]]:
+    """Correlate samples with a bank's replicas (or some rows of it), ``ROWS_AT_ONCE`` at a time.
+
+    Yields the first row of each part, counted from the first asked for, and the part (k, count): good until the next.
+    """
     import scipy.fft
 
     # short searches share one length, so that their spectra are computed once
     length = bank.length(max(count, SHORT_SEARCH))
     spectrum = np.asarray(scipy.fft.fft(stretch.astype(np.complex64), length))
     spectra = bank.spectra(length)[rows]
-    best = np.full(count, -1.0, np.float32)
-    row = np.zeros(count, np.int64)
-    some = np.empty((len(spectra), (count - 1) // EVERY + 1), np.float32)
     work = np.empty((ROWS_AT_ONCE, length), np.complex64)  # one that stays in the cache
     for low in range(0, len(spectra), ROWS_AT_ONCE):
-        some_rows = spectra[low : low + ROWS_AT_ONCE]
-        product = np.multiply(some_rows, spectrum, out=work[: len(some_rows)])
-        surface = np.asarray(scipy.fft.ifft(product, axis=-1, overwrite_x=True))
-        _highest(surface, low, best, row, some)
-    return best, row, some
+        part = spectra[low : low + ROWS_AT_ONCE]
+        product = np.multiply(part, spectrum, out=work[: len(part)])
+        yield low, np.asarray(scipy.fft.ifft(product, axis=-1, overwrite_x=True), np.complex64)[:, :count]
 
 
 def search_near(
@@ -118,7 +129,7 @@ def search_near(
     false_alarm_rate: float,
 ) -> Peak | None:
     """As `search`, for few delays and the range rates ``rates`` (low, high), m/s; noise is the power of all heard."""
-    first, count = _delays(baseband, start_s, bank, band, opens_s, closes_s)
+    first, count = delays(baseband, start_s, bank, band, opens_s, closes_s)
     if count < 1:
         return None
     low = max(0, int(np.searchsorted(bank.range_rate_mps, rates[0])) - 1)
@@ -131,10 +142,10 @@ def search_near(
     return _peak(best, row, start_s, first, bank, band, known_s, noise, count * (high - low), false_alarm_rate)
 
 
-def _delays(
+def delays(
     baseband: NDArray[np.complexfloating], start_s: float, bank: Bank, band: Band, opens_s: float, closes_s: float
 ) -> tuple[int, int]:
-    """First sample at which a replica may begin, and how many there are."""
+    """First sample at which a replica may begin, and how many there are; at most 0 where the base band ends before."""
     first = max(0, int(np.floor((opens_s - bank.lead_s - start_s) * band.rate_hz)))
     last = min(len(baseband) - 1, int(np.ceil((closes_s - bank.lead_s - start_s) * band.rate_hz)))
     return first, last - first + 1

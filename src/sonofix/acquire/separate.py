@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -18,10 +17,12 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank
 from sonofix.acquire.baseband import Band
+from sonofix.acquire.clicks import find_clicks
 from sonofix.acquire.refine import FRESH_RAD, STALE_RAD, Burst, Joint
+from sonofix.acquire.report import detection_of
 from sonofix.acquire.search import Peak, search, search_near
 from sonofix.acquire.tones import MARGIN_S, Tone, refit
-from sonofix.records import Detection, Floats, Path, Prediction, Waveform
+from sonofix.records import Detection, Prediction
 
 STANDS_OUT = 10 ** (3 / 10)
 """Over the second highest of its own search: cross-talk and echoes make many peaks alike."""
@@ -58,14 +59,6 @@ COLLAPSED = 0.1
 
 ECHO_POWER = 10 ** (-26 / 10)
 """Weaker echoes than this share of a burst's strongest path are not looked for."""
-
-IMPULSE = 10.0
-"""Power over the median of what is left, both smoothed over ``IMPULSE_SAMPLES``, that no burst leaves so briefly."""
-
-IMPULSE_SAMPLES = 8
-
-IMPULSE_SHARE = 0.15
-"""Of a burst's length: the longest impulse; of an epoch: the most that is set aside."""
 
 MOST_PATHS = 12
 """Of one burst."""
@@ -117,6 +110,18 @@ class Separation:
         As in `plan.Plan`.
     watch : Watch or None
         Is told what is done.
+
+    Attributes
+    ----------
+    sounds : list of Sound
+        Paths found so far; burst i of ``joint`` is that of ``sounds[i]``.
+    joint : Joint
+    predictions : mapping from emitter id to Prediction
+        What is gone by; empty once they proved wrong.
+    floor : float
+        Noise power by the quieter of the two margins.
+    notes : list of str
+        What was done to the samples.
     """
 
     def __init__(
@@ -144,108 +149,104 @@ class Separation:
         self.joint = Joint(
             baseband - self._tone(), start_s, band.rate_hz, kappa_sd, band.whiteness, max(1, 2 * len(banks))
         )
-        self._floor = self._margin_power()
-        self._predictions: Mapping[str, Prediction] = {}
+        self.floor = self._margin_power()
+        self.predictions: Mapping[str, Prediction] = {}
 
     def run(self, predictions: Mapping[str, Prediction]) -> None:
-        """Find all there is: first where it is predicted, then, if that does not explain what is heard, everywhere."""
+        """Find all there is, where it is predicted; if nothing came as predicted, everywhere."""
         if not self.banks:
             return
-        self._predictions = predictions
+        self.predictions = predictions
         self._take_apart()
-        if predictions and not any(self._awaited(i) for i in range(len(self.sounds))):
+        if predictions and not any(self.awaited(i) for i in range(len(self.sounds))):
             # nothing came as predicted: then the prediction is what is wrong
             self._tell("unpredicted", ())
             self._keep([])
-            self._predictions = {}
+            self.predictions = {}
             self._take_apart()
 
     def _take_apart(self) -> None:
-        self._take_beacons(self._predictions)
+        self._take_beacons()
         self._settle()
         if self._disturbed():
             self._straighten()
-            self._leave_out_impulses()
+            self._leave_out_clicks()
             self._take_crowd()
         elif self._prune():
             # what had been mistaken for a burst may have hidden it
-            self._take_beacons(self._predictions)
+            self._take_beacons()
         self._prune()
         if self._disturbed():
             self._verify()
 
     def _straighten(self) -> None:
         """Give bursts the curvature that explains them, loudest first: what a poor fit of one leaves disturbs all."""
-        if any(
-            [self.joint.straighten(int(i)) for i in np.argsort([-self._energy(i) for i in range(len(self.sounds))])]
-        ):
+        loudest_first = np.argsort([-self.energy(i) for i in range(len(self.sounds))])
+        if any([self.joint.straighten(int(i)) for i in loudest_first]):  # of all, not up to the first that changed
             self._settled = False
             self._settle()
 
-    def _leave_out_impulses(self) -> None:
-        """Set aside clicks and drop-outs: what is far above the rest of what is left, for far shorter than a burst."""
+    def _leave_out_clicks(self) -> None:
+        """Set aside clicks and drop-outs."""
         if not (self.sounds and self._disturbed()):
             return
-        power = np.abs(self.joint.residual) ** 2
-        smooth = np.convolve(power, np.ones(IMPULSE_SAMPLES) / IMPULSE_SAMPLES, "same")
-        loud = smooth > IMPULSE * np.median(smooth[smooth > 0])
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], loud, [False]])))
-        longest = IMPULSE_SHARE * min(b.waveform.duration_s for b in self.joint.bursts) * self.band.rate_hz
-        aside = np.zeros(len(loud), bool)
-        runs = [(a, b) for a, b in edges.reshape(-1, 2) if b - a <= longest]
-        for begin, end in runs:
-            aside[begin:end] = True
-        # what echoes leave has its peaks too, but not most of its power in them
-        if np.mean(aside) > IMPULSE_SHARE or np.sum(power[aside]) < 0.5 * np.sum(power):
+        shortest_s = min(b.waveform.duration_s for b in self.joint.bursts)
+        clicks = find_clicks(self.joint.residual, shortest_s * self.band.rate_hz)
+        if not len(clicks):
             return
+        aside = np.zeros(len(self.baseband), bool)
+        for begin, end in clicks:
+            aside[begin:end] = True
         self.joint.leave_out(aside)
         self._settled = False
         self._settle()
         lasted_ms = 1e3 * np.sum(aside) / self.band.rate_hz
-        self.notes.append(f"{len(runs)} clicks or drop-outs, {lasted_ms:.0f} ms in all, were left out")
+        self.notes.append(f"{len(clicks)} clicks or drop-outs, {lasted_ms:.0f} ms in all, were left out")
         self._tell("aside", ())
 
     def _verify(self) -> None:
         """Drop what no longer stands above the cross-talk of all that is left, beside what no burst explains."""
         doubtful = set(self.windows)
         while doubtful:
-            dropped = [i for i, s in enumerate(self.sounds) if s.bank.emitter in doubtful and not self._stands_out(i)]
+            disturbed = self._disturbed()
+            dropped = [
+                i
+                for i, s in enumerate(self.sounds)
+                if s.bank.emitter in doubtful and not self._stands_out(i, disturbed)
+            ]
             doubtful = {self.sounds[i].bank.emitter for i in dropped}
             if dropped:
                 self._tell("alike", dropped)
                 self._keep([i for i in range(len(self.sounds)) if i not in dropped])
                 self._prune()
 
-    def _sure(self, i: int, noise: float) -> bool:
-        """Whether a burst stands above the noise left around it, or out of a search."""
+    def _sure(self, i: int, noise: float, disturbed: bool) -> bool:
+        """Whether a burst stands above the noise left around it, or out of a search; ``disturbed`` as `_disturbed`."""
         sound = self.sounds[i]
-        if self.joint.matched(i) < MATCHED * self._energy(i):
+        if self.joint.matched(i) < MATCHED * self.energy(i):
             return False
-        above = self._energy(i) / (sound.threshold * noise)
+        above = self.energy(i) / (sound.threshold * noise)
         if sound.clear and above > CLEARED:
             return True
         # among echoes the direct path need not be the highest of all
-        return (above > 1.0 and (not sound.sought or self._disturbed())) or self._stands_out(i)
+        return (above > 1.0 and (not sound.sought or disturbed)) or self._stands_out(i, disturbed)
 
-    def _stands_out(self, i: int) -> bool:
+    def _stands_out(self, i: int, disturbed: bool) -> bool:
         """Whether a burst stands out of a search of its code in what all other bursts leave.
 
         Cross-talk makes a forest of peaks, none far above the mean; a path may have echoes as strong, but stands high.
         What was found near a prediction must be the highest of all, unless there are echoes.
         """
         bank = self.sounds[i].bank
-        known_s = [self._begins_s(k) for k, s in enumerate(self.sounds) if s.bank is bank and k != i]
+        known_s = [self.begins_s(k) for k, s in enumerate(self.sounds) if s.bank is bank and k != i]
         heard = self.joint.residual_with(i)
         peak = search(heard, self.start_s, bank, self.band, *self.windows[bank.emitter], known_s, self.false_alarm_rate)
         if peak is None:
             return False
-        energy, floor = self._energy(i), peak.threshold * peak.noise
-        if (
-            self.sounds[i].sought
-            and not self._disturbed()
-            and abs(peak.start_s - self._begins_s(i)) > FLANK / self.band.half_width_hz
-        ):
+        on_flank = abs(peak.start_s - self.begins_s(i)) > FLANK / self.band.half_width_hz
+        if self.sounds[i].sought and not disturbed and on_flank:
             return False
+        energy, floor = self.energy(i), peak.threshold * peak.noise
         return energy > floor and (energy > STANDS_OUT * peak.second or energy > HIGH * floor)
 
     def _collapsed(self, i: int) -> bool:
@@ -269,7 +270,7 @@ class Separation:
         self.joint.keep(which)
         self._settled = False
 
-    def _take_beacons(self, predictions: Mapping[str, Prediction]) -> None:
+    def _take_beacons(self) -> None:
         """Accept what stands out, and search the rest in what is left."""
         before: list[tuple[Bank, Peak]] = []
         while True:
@@ -278,24 +279,24 @@ class Separation:
             if stayed:
                 self._accept(stayed)
             missing = [bank for bank in self.banks if not any(s.bank is bank for s in self.sounds)]
-            found = [(bank, peak) for bank in missing if (peak := self._look(bank, predictions)) is not None]
+            found = [(bank, peak) for bank in missing if (peak := self._look(bank)) is not None]
             if not found:
                 return
             strongest = max(peak.power for _, peak in found)
             sure = [
                 (bank, peak)
                 for bank, peak in found
-                if (peak.power > peak.threshold * peak.noise or not predictions)
+                if (peak.power > peak.threshold * peak.noise or not self.predictions)
                 and peak.power
                 > (STANDS_OUT if peak.power > self._cross_talk(bank) * strongest else ALONE) * peak.second
             ]
             if not sure:
                 # a prediction leaves little room for anything else; without, the loudest of a crowd may be an echo
-                if self._disturbed() and not predictions:
+                if self._disturbed() and not self.predictions:
                     return
                 sure = [max(found, key=lambda one: one[1].power)]
             self._accept(sure)
-            if not predictions:
+            if not self.predictions:
                 accepted = {bank.emitter for bank, _ in sure}
                 before = [(bank, peak) for bank, peak in found if bank.emitter not in accepted]
 
@@ -334,52 +335,57 @@ class Separation:
                 bank = max(waiting, key=lambda b: p.power if (p := last.get(b.emitter)) else np.inf)
                 if bank.emitter in fresh:
                     break
-                last[bank.emitter] = self._look(bank, self._predictions, True) or self._look(bank, {}, True)
+                last[bank.emitter] = self._look(bank, echoes=True)
                 fresh.add(bank.emitter)
             peak = last[bank.emitter]
             assert peak is not None
             self._accept([(bank, peak)], CROWD_ITERATIONS)
 
-    def _look(self, bank: Bank, predictions: Mapping[str, Prediction], echoes: bool = False) -> Peak | None:
-        """Search one emitter in what is left; None where nothing is worth trying."""
+    def _look(self, bank: Bank, echoes: bool = False) -> Peak | None:
+        """Search one emitter in what is left, where its direct path is predicted and, for ``echoes``, then everywhere.
+
+        None where nothing is worth trying.
+        """
         own = [i for i, s in enumerate(self.sounds) if s.bank is bank]
         if len(own) >= MOST_PATHS:
             return None
         opens_s, closes_s = self.windows[bank.emitter]
-        known_s = [self._begins_s(i) for i in own]
-        expected = None if any(self._awaited(i) for i in own) else predictions.get(bank.emitter)
-        left = self.joint.residual
-        if expected is None:
-            peak = search(left, self.start_s, bank, self.band, opens_s, closes_s, known_s, self.false_alarm_rate)
-        else:
-            begins_s = expected.arrival_s - bank.waveform.duration_s / 2
-            reach_s = self._reach_s(expected)
+        known_s = [self.begins_s(i) for i in own]
+        heard = (self.joint.residual, self.start_s, bank, self.band)
+        expected = None if any(self.awaited(i) for i in own) else self.predictions.get(bank.emitter)
+        if expected is not None:
+            begins_s, reach_s = expected.arrival_s - bank.waveform.duration_s / 2, self.reach_s(expected)
             reach = 5 * expected.range_rate_sd_mps
-            peak = search_near(
-                left,
-                self.start_s,
-                bank,
-                self.band,
+            near = search_near(
+                *heard,
                 max(opens_s, begins_s - reach_s),
                 min(closes_s, begins_s + reach_s),
                 (expected.range_rate_mps - reach, expected.range_rate_mps + reach),
                 known_s,
                 self.false_alarm_rate,
             )
+            if self._worth(near, own, echoes):
+                return near
+            if not echoes:
+                return None
+        peak = search(*heard, opens_s, closes_s, known_s, self.false_alarm_rate)
+        return peak if self._worth(peak, own, echoes) else None
+
+    def _worth(self, peak: Peak | None, own: list[int], echoes: bool) -> bool:
+        """Whether a peak is worth trying beside its emitter's own paths."""
         if peak is None:
-            return None
+            return False
         # many loud bursts at once raise the median that noise is judged by: the quiet margins know better
-        noise = min(peak.noise, self._floor * self.band.whiteness) if echoes else peak.noise
-        if peak.power < (peak.threshold if own else peak.worth_trying) * noise:
-            return None
-        return peak if peak.power > ECHO_POWER * max((self.sounds[i].power for i in own), default=0.0) else None
+        noise = min(peak.noise, self.floor * self.band.whiteness) if echoes else peak.noise
+        least = (peak.threshold if own else peak.worth_trying) * noise
+        return peak.power >= least and peak.power > ECHO_POWER * max((self.sounds[i].power for i in own), default=0.0)
 
     def _accept(self, found: list[tuple[Bank, Peak]], iterations: int = 1) -> None:
         for bank, peak in found:
             middle_s = peak.start_s + bank.waveform.duration_s / 2
             self.joint.add(Burst(bank.waveform, middle_s, peak.range_rate_mps / self.sound_speed_mps, 0.0, 0j))
             clear = peak.power > peak.threshold * peak.noise and peak.power > STANDS_OUT * peak.second
-            sought = bank.emitter in self._predictions and not clear
+            sought = bank.emitter in self.predictions and not clear
             self.sounds.append(Sound(bank, peak.power, peak.threshold, clear, sought))
         self._settled = False
         self._settle(iterations)
@@ -406,8 +412,8 @@ class Separation:
                 self._tell("merged", merged)
                 self._keep([i for i in range(len(self.sounds)) if i not in merged])
                 continue
-            noise = self.joint.noise()
-            sure = [i for i, power in enumerate(noise) if self._sure(i, float(power))]
+            noise, disturbed = self.joint.noise(), self._disturbed()
+            sure = [i for i, power in enumerate(noise) if self._sure(i, float(power), disturbed)]
             if len(sure) == len(self.sounds):
                 break
             self._tell("weak", sorted(set(range(len(self.sounds))) - set(sure)))
@@ -423,15 +429,15 @@ class Separation:
             own = [i for i, s in enumerate(self.sounds) if s.bank is bank]
             if not own:
                 continue
-            strongest = max(self._energy(i) for i in own)
-            weighty = [i for i in own if self._energy(i) >= PATH_POWER * strongest and self._awaited(i)]
+            strongest = max(self.energy(i) for i in own)
+            weighty = [i for i in own if self.energy(i) >= PATH_POWER * strongest and self.awaited(i)]
             if not weighty:
                 continue
             first = min(weighty, key=lambda i: self.joint.bursts[i].arrival_s)
             if self._whole(first):
                 bursts = [self.joint.bursts[i] for i in own]
                 out.append(
-                    _detection(
+                    detection_of(
                         bank.emitter,
                         self.joint.bursts[first],
                         bursts,
@@ -442,23 +448,23 @@ class Separation:
                 )
         return out
 
-    def _reach_s(self, expected: Prediction) -> float:
+    def reach_s(self, expected: Prediction) -> float:
         """How far from its predicted arrival a burst is looked for."""
         return 5 * expected.arrival_sd_s + 2 / self.band.rate_hz
 
-    def _awaited(self, i: int) -> bool:
+    def awaited(self, i: int) -> bool:
         """Whether burst i came when its emitter's direct path was predicted, or nothing was."""
-        expected = self._predictions.get(self.sounds[i].bank.emitter)
+        expected = self.predictions.get(self.sounds[i].bank.emitter)
         if expected is None:
             return True
-        return abs(self.joint.bursts[i].arrival_s - expected.arrival_s) <= 1.2 * self._reach_s(expected)
+        return abs(self.joint.bursts[i].arrival_s - expected.arrival_s) <= 1.2 * self.reach_s(expected)
 
-    def _begins_s(self, i: int) -> float:
+    def begins_s(self, i: int) -> float:
         """When the first chip of burst i is heard."""
         burst = self.joint.bursts[i]
         return burst.arrival_s - burst.waveform.duration_s / 2
 
-    def _energy(self, i: int) -> float:
+    def energy(self, i: int) -> float:
         """Of burst i's signature, as a matched filter sees it."""
         return abs(self.joint.bursts[i].gain) ** 2 * self.sounds[i].bank.energy
 
@@ -474,17 +480,21 @@ class Separation:
 
     def _disturbed(self) -> bool:
         """Whether more is left, while bursts sound, than their quiet margins have."""
-        first, last = 0, len(self.baseband)
-        if self.sounds:
-            begins_s = min(self._begins_s(i) for i in range(len(self.sounds))) - 2e-3
-            ends_s = max(
-                self._begins_s(i) + 1.01 * (len(b.waveform.envelope) / b.waveform.rate_hz + b.waveform.start_s)
-                for i, b in enumerate(self.joint.bursts)
-            )
-            first = max(0, int((begins_s - self.start_s) * self.band.rate_hz))
-            last = max(first, int((ends_s - self.start_s) * self.band.rate_hz) + 1)
+        first, last = self.sounding()
         left = self.joint.residual[first:last][self.joint.counted[first:last]]
-        return bool(len(left)) and float(np.mean(np.abs(left) ** 2)) > UNEXPLAINED * self._floor
+        return bool(len(left)) and float(np.mean(np.abs(left) ** 2)) > UNEXPLAINED * self.floor
+
+    def sounding(self) -> tuple[int, int]:
+        """First and past-the-last sample in which any burst sounds, its ring included; all where none was found."""
+        if not self.sounds:
+            return 0, len(self.baseband)
+        begins_s = min(self.begins_s(i) for i in range(len(self.sounds))) - 2e-3
+        ends_s = max(
+            self.begins_s(i) + 1.01 * (len(b.waveform.envelope) / b.waveform.rate_hz + b.waveform.start_s)
+            for i, b in enumerate(self.joint.bursts)
+        )
+        first = max(0, int((begins_s - self.start_s) * self.band.rate_hz))
+        return first, max(first, int((ends_s - self.start_s) * self.band.rate_hz) + 1)
 
     def _whole(self, i: int) -> bool:
         """Whether the recording, which begins at 0, holds a burst from its first chip to its last.
@@ -495,35 +505,4 @@ class Separation:
         half_s = burst.waveform.duration_s / 2
         end_s = self.start_s + len(self.baseband) / self.band.rate_hz
         guard_s = min(half_s, 5e-3) if self.windows[self.sounds[i].bank.emitter][0] < 0 else 0.0
-        return self._begins_s(i) >= max(self.start_s, guard_s) and burst.arrival_s + half_s <= end_s
-
-
-@lru_cache(maxsize=256)
-def mean_power(w: Waveform) -> float:
-    """Of a burst of unit gain, from its first chip to its last."""
-    inside = slice(int(-w.start_s * w.rate_hz), int((w.duration_s - w.start_s) * w.rate_hz))
-    return float(np.mean(np.abs(w.envelope[inside]) ** 2))
-
-
-def _detection(
-    emitter: str, burst: Burst, own: list[Burst], covariance: Floats, noise: float, receiver: str
-) -> Detection:
-    power = abs(burst.gain) ** 2 * mean_power(burst.waveform)
-    paths = tuple(
-        Path(
-            b.arrival_s - burst.arrival_s,
-            float(20 * np.log10(max(abs(b.gain), 1e-12) / max(abs(burst.gain), 1e-12))),
-        )
-        for b in own
-    )
-    return Detection(
-        emitter=emitter,
-        receiver=receiver,
-        arrival_s=burst.arrival_s,
-        time_scale=1.0 - burst.beta,
-        # β and the time scale differ in sign
-        covariance=covariance * np.array([[1.0, -1.0], [-1.0, 1.0]]),
-        amplitude=abs(burst.gain),
-        snr_db=float(10 * np.log10(max(power, 1e-30) / noise)),
-        paths=paths,
-    )
+        return self.begins_s(i) >= max(self.start_s, guard_s) and burst.arrival_s + half_s <= end_s
