@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sonofix.acquire.baseband import band_limited, design_band
-from sonofix.acquire.kernels import add_model, assemble, bent, columns
+from sonofix.acquire.kernels import add_model, assemble, columns, matched_parts
 from sonofix.acquire.refine import FRESH_RAD, Burst, Joint
 from sonofix.records import Floats
 from sonofix.signals import codes
@@ -134,15 +134,20 @@ def test_residual_is_what_bursts_leave(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(joint.residual, left + 0.5, atol=1e-6)
 
 
-def test_power_explained_is_that_of_the_plain_model(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("parts", [1, 7])
+def test_parts_matched_are_those_of_the_plain_model(parts: int, rng: np.random.Generator) -> None:
     heard = model(BURSTS[0]) + noisy(rng, 1e-2)
-    betas, kappas = BURSTS[0].beta + np.array([-2e-4, 0.0, 3e-4]), np.array([-0.01, BURSTS[0].kappa])
-    power = bent(heard, *fixed(BURSTS[0]), BURSTS[0].arrival_s, betas, kappas)
-    for i, kappa in enumerate(kappas):
-        for j, beta in enumerate(betas):
-            plain = model(replace(BURSTS[0], beta=float(beta), kappa=float(kappa), gain=1.0))
-            expected = np.abs(np.vdot(plain, heard)) ** 2 / np.vdot(plain, plain).real
-            assert power[i, j] == pytest.approx(expected, rel=1e-6)
+    burst = BURSTS[0]
+    seen, middle_s, energy = matched_parts(heard, *fixed(burst), burst.arrival_s, burst.beta + 2e-4, burst.kappa, parts)
+    plain = model(replace(burst, beta=burst.beta + 2e-4, gain=1.0))
+    out = np.zeros((4, 2, len(heard)), np.float32)
+    sounding = np.arange(*columns(*fixed(burst), burst.arrival_s, burst.beta + 2e-4, burst.kappa, out))
+    pieces = np.split(sounding, np.arange(1, parts) * -(-len(sounding) // parts))
+    for k, piece in enumerate(pieces):
+        assert seen[k] == pytest.approx(np.vdot(plain[piece], heard[piece]), rel=1e-6)
+        if k < parts - 1:
+            assert middle_s[k] == pytest.approx(START_S + np.mean(piece) / RATE_HZ - burst.arrival_s)
+    assert energy == pytest.approx(np.vdot(plain, plain).real, rel=1e-6)
 
 
 def test_a_curvature_far_off_is_found(rng: np.random.Generator) -> None:

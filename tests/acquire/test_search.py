@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank, make_bank, velocity_step_mps
 from sonofix.acquire.baseband import Band, band_limited, design_band
-from sonofix.acquire.search import Peak, profile, search, search_near
+from sonofix.acquire.search import Peak, near, profile, search, search_near
 from sonofix.signals import codes
 from sonofix.signals.interpolate import sample
 from sonofix.signals.waveform import keyed_waveform
@@ -108,8 +108,23 @@ def test_near_search_finds_what_the_whole_search_finds(rate: float, rng: np.rand
     part = found(samples, opens_s=0.048, closes_s=0.052, rates=(rate - 0.5, rate + 0.5))
     assert part.start_s == pytest.approx(whole.start_s, abs=1.1 / BAND.rate_hz)
     assert abs(part.range_rate_mps - whole.range_rate_mps) <= 1.1 * STEP_MPS
-    # short blocks and few replicas cost a little
     assert 0.8 * whole.power < part.power < 1.05 * whole.power
+
+
+@pytest.mark.parametrize("rows", [(0, 9), (20, 21), (14, 40)])
+def test_parts_put_together_are_the_plain_correlations(rows: tuple[int, int], rng: np.random.Generator) -> None:
+    low, high = min(rows[0], len(BANK.replicas) - 2), min(rows[1], len(BANK.replicas))
+    rate = float(np.mean(BANK.range_rate_mps[low:high])) + 0.3 * STEP_MPS
+    samples = heard(BANK, BAND, 0.05, rate, 0.1) + noise(rng, 1e-5)
+    first, count, length = round(0.045 * BAND.rate_hz), 60, BANK.replicas.shape[1]
+    best, row = near(samples, first, count, BANK, low, high, BAND.rate_hz)
+    windows = np.lib.stride_tricks.sliding_window_view(samples[first : first + count + length - 1], length)
+    plain = np.abs(np.conj(BANK.replicas[low:high]) @ windows.T) ** 2
+    top = plain.max()
+    np.testing.assert_allclose(best, plain.max(axis=0), rtol=0.2, atol=0.02 * top)
+    column = int(np.argmax(plain.max(axis=0)))
+    assert int(np.argmax(best)) == column
+    assert plain[row[column] - low, column] > 0.9 * top
 
 
 def test_noise_is_told_from_its_median(rng: np.random.Generator) -> None:

@@ -123,7 +123,7 @@ def add_model(
 
 
 @numba.njit(cache=True)
-def bent(
+def matched_parts(
     heard: NDArray[np.complex128],
     table: NDArray[np.complex128],
     table_rate_hz: float,
@@ -133,36 +133,62 @@ def bent(
     start_s: float,
     rate_hz: float,
     arrival_s: float,
-    betas: Floats,
-    kappas: Floats,
-) -> Floats:
-    """Power (kappas, betas) that one burst's model explains of ``heard`` (n,) at each β and κ, its gain free."""
-    out = np.zeros((kappas.shape[0], betas.shape[0]))
-    model = np.empty_like(heard)
-    for i in range(kappas.shape[0]):
-        for j in range(betas.shape[0]):
-            model[:] = 0.0
-            add_model(
-                model,
-                table,
-                table_rate_hz,
-                table_start_s,
-                half_s,
-                carrier_hz,
-                start_s,
-                rate_hz,
-                arrival_s,
-                betas[j],
-                kappas[i],
-                1.0 + 0.0j,
-            )
-            seen = 0.0 + 0.0j
-            energy = 1e-300
-            for n in range(heard.shape[0]):
-                seen += np.conj(model[n]) * heard[n]
-                energy += model[n].real ** 2 + model[n].imag ** 2
-            out[i, j] = (seen.real**2 + seen.imag**2) / energy
-    return out
+    beta: float,
+    kappa: float,
+    parts: int,
+) -> tuple[NDArray[np.complex128], Floats, float]:
+    """Inner products (parts,) of a burst's model of unit gain with ``heard`` (n,), part by part of its length.
+
+    Also the middle of each part, from the arrival (parts,), and the model's energy.
+    """
+    first, last = _sounding(
+        table.shape[0], table_rate_hz, table_start_s, half_s, start_s, rate_hz, heard.shape[0], arrival_s, beta, kappa
+    )
+    seen, middle_s, energy = np.zeros(parts, np.complex128), np.zeros(parts), 1e-300
+    step_s = 1.0 / rate_hz
+    carrier = 1.0 + 0.0j
+    ahead = 1.0 + 0.0j
+    bend = _turned(carrier_hz, 0.0, 2.0 * kappa, step_s)
+    size = max(1, -(-(last - first) // parts))
+    for n in range(first, last):
+        u = start_s + n / rate_hz - arrival_s
+        if (n - first) % RENEWED == 0:
+            carrier = _turned(carrier_hz, beta, kappa, u)
+            ahead = _turned(carrier_hz, beta, kappa, u + step_s) * np.conj(carrier)
+        tau = half_s + u - beta * u - 0.5 * kappa * u * u
+        model = read(table, (tau - table_start_s) * table_rate_hz) * carrier
+        seen[(n - first) // size] += np.conj(model) * heard[n]
+        energy += model.real**2 + model.imag**2
+        carrier *= ahead
+        ahead *= bend
+    for p in range(parts):
+        middle_s[p] = start_s + (first + p * size + (size - 1) / 2.0) / rate_hz - arrival_s
+    return seen, middle_s, energy
+
+
+@numba.njit(cache=True)
+def left_around(
+    left: NDArray[np.complex128], left_out: NDArray[np.bool_], support: NDArray[np.int64]
+) -> tuple[Floats, int]:
+    """Mean power of ``left`` (n,) over each burst's ``support`` (k, 2), and how many samples lie in any or between.
+
+    What is left out counts as neither power nor sample.
+    """
+    out = np.zeros(support.shape[0])
+    begin, end = left.shape[0], 0
+    for i in range(support.shape[0]):
+        first, last = support[i]
+        begin, end = min(begin, first), max(end, last)
+        total, samples = 0.0, 0
+        for n in range(first, last):
+            if not left_out[n]:
+                total += left[n].real ** 2 + left[n].imag ** 2
+                samples += 1
+        out[i] = total / max(samples, 1)
+    counted = 0
+    for n in range(begin, end):
+        counted += not left_out[n]
+    return out, counted
 
 
 @numba.njit(cache=True)

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.acquire.kernels import add_model, assemble, bent, columns
+from sonofix.acquire.kernels import add_model, assemble, columns, left_around, matched_parts
 from sonofix.records import Floats, Waveform
 
 Complexes = NDArray[np.complex128]
@@ -33,6 +33,9 @@ bursts are still being found, and when it is to be exact."""
 SETTLED_RAD = 3e-4
 """A step that turns no phase by more changes nothing: 10 µm."""
 
+UNCHANGED = 1e-7
+"""Of the misfit: a step that changes it by less, either way, ends the descent."""
+
 MOST_DAMPING = 1e3
 
 PLAUSIBLE = 3.0
@@ -41,6 +44,9 @@ PLAUSIBLE = 3.0
 BEND_STEP_RAD = 1.2
 MOST_BEND_RAD = 24.0
 """What steps and limits of curvature turn a burst's end by, against its middle."""
+
+PARTS = 128
+"""Of a burst, within each of which no plausible curvature turns the phase far."""
 
 MUCH_MORE = 1.6
 """Power explained, over that of the present fit, at which another curvature is taken."""
@@ -169,13 +175,15 @@ class Joint:
             residual = self._left(moved)
             tried = _power(residual) + float(np.sum(weight * (state[:, 2] + move[:, 2]) ** 2))
             if tried > cost * (1 + 1e-12):
+                if tried < cost * (1 + UNCHANGED):
+                    break
                 damping = max(4 * damping, 0.05)
                 if damping > MOST_DAMPING:
                     break
                 continue
             self.bursts, self.residual = moved, residual
             state, gain = state + move, np.array([b.gain for b in moved])
-            settled = cost - tried < 1e-7 * cost or np.max(np.abs(move) * self._turn[: len(moved)]) < SETTLED_RAD
+            settled = cost - tried < UNCHANGED * cost or np.max(np.abs(move) * self._turn[: len(moved)]) < SETTLED_RAD
             damping /= 4
             if settled:
                 break
@@ -200,12 +208,17 @@ class Joint:
         reach = most * burst.waveform.duration_s / 4
         betas = burst.beta + np.linspace(-reach, reach, 2 * int(np.ceil(reach * by_beta / BEND_STEP_RAD)) + 1)
         heard, fixed = self.residual_with(i), self._fixed(burst.waveform, burst.waveform.envelope)
-        power = bent(heard, *fixed, burst.arrival_s, betas, kappas)
+        # what another line or parabola turns is turned part by part; the code's own stretch by it is small
+        seen, u_s, _ = matched_parts(heard, *fixed, burst.arrival_s, burst.beta, burst.kappa, PARTS)
+        turn = 2j * np.pi * burst.waveform.carrier_hz
+        bends = np.exp(turn / 2 * np.outer(kappas - burst.kappa, u_s**2))
+        power = np.abs(bends * seen @ np.exp(turn * np.outer(u_s, betas - burst.beta))) ** 2
         k, b = np.unravel_index(int(np.argmax(power)), power.shape)
-        now = bent(heard, *fixed, burst.arrival_s, np.array([burst.beta]), np.array([burst.kappa]))[0, 0]
-        if not power[k, b] > MUCH_MORE * now:
+        now = self._explained(heard, burst, burst.waveform.envelope)
+        better = replace(burst, beta=float(betas[b]), kappa=float(kappas[k]))
+        if not self._explained(heard, better, burst.waveform.envelope) > MUCH_MORE * now:
             return False
-        self.bursts[i] = replace(burst, beta=float(betas[b]), kappa=float(kappas[k]))
+        self.bursts[i] = better
         self._renew(i)
         self.residual = heard
         self._solve_gain(i)
@@ -217,21 +230,15 @@ class Joint:
         That of a burst is its energy; a fit that took other bursts' carrier for its own has less.
         """
         burst = self.bursts[i]
-        fixed = self._fixed(burst.waveform, burst.waveform.signature)
-        bend = np.array([burst.beta]), np.array([burst.kappa])
-        return float(bent(self.residual_with(i), *fixed, burst.arrival_s, *bend)[0, 0])
+        return self._explained(self.residual_with(i), burst, burst.waveform.signature)
 
     def noise(self) -> Floats:
         """White-equivalent power left per sample around each burst (k,)."""
-        # power and samples up to each moment; what is left out counts as neither
-        total = np.zeros(len(self.residual) + 1)
-        np.cumsum(self.residual.real**2 + self.residual.imag**2, out=total[1:])
-        counted = np.concatenate([[0], np.cumsum(self.counted)])
-        first, last = self._support[: len(self.bursts)].T
-        power = self._whiteness * (total[last] - total[first]) / np.maximum(counted[last] - counted[first], 1)
+        support = self._support[: len(self.bursts)]
+        power, counted = left_around(self.residual, self._left_out, support)
+        power *= self._whiteness
         # what went into the fit, five real numbers a burst, is missing from what is left
-        span = counted[int(np.max(last, initial=1))] - counted[int(np.min(first, initial=len(self.residual)))]
-        share = np.maximum(1.0 - 2.5 * len(self.bursts) / max(int(span), 1), 0.1)
+        share = max(1.0 - 2.5 * len(self.bursts) / max(counted, 1), 0.1)
         return np.maximum(power / share, 1e-24)
 
     def covariances(self, noise: Floats) -> list[Floats]:
@@ -287,6 +294,12 @@ class Joint:
             fixed = self._fixed(burst.waveform, burst.waveform.envelope)
             add_model(residual, *fixed, burst.arrival_s, burst.beta, burst.kappa, -burst.gain)
         residual[self._left_out] = 0.0
+
+    def _explained(self, heard: Complexes, burst: Burst, table: Complexes) -> float:
+        """Power that a burst, heard with one of its waveform's tables, explains of ``heard`` (n,), its gain free."""
+        fixed = self._fixed(burst.waveform, table)
+        seen, _, energy = matched_parts(heard, *fixed, burst.arrival_s, burst.beta, burst.kappa, 1)
+        return float(abs(seen[0]) ** 2 / energy)
 
     def _fixed(self, w: Waveform, table: Complexes) -> tuple[Complexes, float, float, float, float, float, float]:
         """What the kernels ask of a burst and of the samples, whatever the burst does."""

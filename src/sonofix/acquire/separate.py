@@ -172,10 +172,11 @@ class Separation:
             self._straighten()
             self._leave_out_clicks()
             self._take_crowd()
+            self._prune()
         elif self._prune():
             # what had been mistaken for a burst may have hidden it
             self._take_beacons()
-        self._prune()
+            self._prune()
         if self._disturbed():
             self._verify()
 

@@ -17,8 +17,8 @@ CAPTURE_NAMES = ("capture.flac", "capture.wav")
 FORMATS = ("FLAC", "WAV", "WAVEX", "RF64", "W64")
 
 _UNKNOWN_COUNT = 2**62
-# A damaged FLAC loses the read call in which the damage lies: read little at a time.
-_READ_FRAMES = 1024
+# A damaged FLAC loses the read call in which the damage lies: read no more at a time than its own usual block.
+_READ_FRAMES = 4096
 
 
 class _Stream(soundfile.SoundFile):
