@@ -147,7 +147,7 @@ def test_parts_matched_are_those_of_the_plain_model(parts: int, rng: np.random.G
         assert seen[k] == pytest.approx(np.vdot(plain[piece], heard[piece]), rel=1e-6)
         if k < parts - 1:
             assert middle_s[k] == pytest.approx(START_S + np.mean(piece) / RATE_HZ - burst.arrival_s)
-    assert energy == pytest.approx(np.vdot(plain, plain).real, rel=1e-6)
+    assert energy.sum() == pytest.approx(np.vdot(plain, plain).real, rel=1e-6)
 
 
 def test_a_curvature_far_off_is_found(rng: np.random.Generator) -> None:
@@ -161,6 +161,37 @@ def test_a_curvature_far_off_is_found(rng: np.random.Generator) -> None:
     assert joint.bursts[0].kappa == pytest.approx(0.45, abs=0.02)
     assert np.mean(np.abs(joint.residual) ** 2) == pytest.approx(1e-4, rel=0.2)
     assert not joint.straighten(0)
+
+
+def test_a_turn_within_a_burst_is_followed(rng: np.random.Generator) -> None:
+    """A source that begins to speed up while it is heard fits no parabola; a phase on top of one does."""
+    burst = replace(BURSTS[0], gain=1.0, kappa=0.0)
+    straight = model(burst)
+    u = START_S + np.arange(len(straight)) / RATE_HZ - burst.arrival_s
+    kink = np.exp(-2j * np.pi * burst.waveform.carrier_hz * 0.5 * 0.15 * np.maximum(u, 0.0) ** 2)
+    joint = Joint(straight * kink + noisy(rng, 1e-4), START_S, RATE_HZ, KAPPA_SD, 1.0)
+    joint.add(replace(burst, gain=0j))
+    joint.settle(20)
+    left = float(np.sum(np.abs(joint.residual) ** 2))
+    wobble, gained = joint.wobble(0)
+    joint.follow(0, wobble)
+    joint.settle(20)
+    now = float(np.sum(np.abs(joint.residual) ** 2))
+    assert left - now == pytest.approx(gained, rel=0.2)
+    assert now - 1e-4 * len(straight) < 0.1 * (left - 1e-4 * len(straight))
+    # the moment of the middle is told by the envelope: it stays
+    assert joint.bursts[0].arrival_s == pytest.approx(burst.arrival_s, abs=1e-5)
+
+
+def test_noise_gives_a_wobble_half_its_power_a_degree(rng: np.random.Generator) -> None:
+    gains = []
+    for _ in range(60):
+        joint = Joint(model(BURSTS[0]) + noisy(rng, 1e-3), START_S, RATE_HZ, KAPPA_SD, 1.0)
+        joint.add(BURSTS[0])
+        joint.settle(10)
+        gains.append(joint.wobble(0)[1] / 1e-3)
+    # χ² of four degrees, halved: mean 2, deviation of the mean of 60 √2 / √60
+    assert np.mean(gains) == pytest.approx(2.0, abs=4 * np.sqrt(2 / 60))
 
 
 def test_a_burst_matches_its_signature_and_a_bare_carrier_does_not(rng: np.random.Generator) -> None:

@@ -136,15 +136,15 @@ def matched_parts(
     beta: float,
     kappa: float,
     parts: int,
-) -> tuple[NDArray[np.complex128], Floats, float]:
+) -> tuple[NDArray[np.complex128], Floats, Floats]:
     """Inner products (parts,) of a burst's model of unit gain with ``heard`` (n,), part by part of its length.
 
-    Also the middle of each part, from the arrival (parts,), and the model's energy.
+    Also the middle of each part, from the arrival, and the model's energy in it (parts,).
     """
     first, last = _sounding(
         table.shape[0], table_rate_hz, table_start_s, half_s, start_s, rate_hz, heard.shape[0], arrival_s, beta, kappa
     )
-    seen, middle_s, energy = np.zeros(parts, np.complex128), np.zeros(parts), 1e-300
+    seen, middle_s, energy = np.zeros(parts, np.complex128), np.zeros(parts), np.full(parts, 1e-300)
     step_s = 1.0 / rate_hz
     carrier = 1.0 + 0.0j
     ahead = 1.0 + 0.0j
@@ -158,7 +158,7 @@ def matched_parts(
         tau = half_s + u - beta * u - 0.5 * kappa * u * u
         model = read(table, (tau - table_start_s) * table_rate_hz) * carrier
         seen[(n - first) // size] += np.conj(model) * heard[n]
-        energy += model.real**2 + model.imag**2
+        energy[(n - first) // size] += model.real**2 + model.imag**2
         carrier *= ahead
         ahead *= bend
     for p in range(parts):

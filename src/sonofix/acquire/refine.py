@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from sonofix.acquire.kernels import add_model, assemble, columns, left_around, matched_parts
@@ -47,6 +48,9 @@ MOST_BEND_RAD = 24.0
 
 PARTS = 128
 """Of a burst, within each of which no plausible curvature turns the phase far."""
+
+WOBBLES = 4
+"""Degrees beyond a parabola's that `Joint.wobble` looks for."""
 
 MUCH_MORE = 1.6
 """Power explained, over that of the present fit, at which another curvature is taken."""
@@ -224,6 +228,46 @@ class Joint:
         self._solve_gain(i)
         return True
 
+    def wobble(self, i: int) -> tuple[Floats, float]:
+        """Phase by which burst i leaves its parabola, as a source does that starts or ends a turn meanwhile.
+
+        Returns
+        -------
+        coefficients : float64 (k,)
+            In rad, of the Legendre polynomials from degree 3 on, over the burst's length.
+        gained : float
+            Power explained more with it than without; noise alone gives half its power a coefficient.
+        """
+        burst = self.bursts[i]
+        fixed = self._fixed(burst.waveform, burst.waveform.envelope)
+        state = burst.arrival_s, burst.beta, burst.kappa
+        seen, u_s, energy = matched_parts(self.residual_with(i), *fixed, *state, PARTS)
+        basis = legendre.legvander(2 * u_s / burst.waveform.duration_s, 2 + WOBBLES)
+        weight = np.sqrt(energy / np.sum(energy))[:, None]
+        before, phase = float(abs(np.sum(seen)) ** 2), np.zeros(WOBBLES)
+        for _ in range(3):
+            turned = seen * np.exp(-1j * basis[:, 3:] @ phase)
+            total = complex(np.sum(turned))
+            # an imaginary part, over what its share of the whole has, is a phase
+            across = (turned * np.conj(total)).imag / max(abs(total) ** 2, 1e-300)
+            phase = phase + np.linalg.lstsq(weight * basis, across / weight[:, 0], rcond=None)[0][3:]
+        after = float(abs(np.sum(seen * np.exp(-1j * basis[:, 3:] @ phase))) ** 2)
+        return phase, (after - before) / float(np.sum(energy))
+
+    def follow(self, i: int, wobble: Floats) -> None:
+        """Turn burst i's waveform by a phase as `wobble` returns it; `settle` all then."""
+        burst = self.bursts[i]
+        w = burst.waveform
+        tau = w.start_s + np.arange(len(w.envelope)) / w.rate_hz
+        # beyond its length, where it rings on, a polynomial would run away
+        inside = np.clip(2 * tau / w.duration_s - 1.0, -1.0, 1.0)
+        turn = np.exp(1j * legendre.legval(inside, np.concatenate([np.zeros(3), wobble])))
+        signature = w.signature * turn
+        envelope = signature if w.signature is w.envelope else w.envelope * turn
+        self.bursts[i] = replace(burst, waveform=replace(w, envelope=envelope, signature=signature))
+        self._renew(i)
+        self.residual = self._left(self.bursts)
+
     def matched(self, i: int) -> float:
         """Power that burst i's signature, without the bare carrier that all bursts share, explains of what is its own.
 
@@ -299,7 +343,7 @@ class Joint:
         """Power that a burst, heard with one of its waveform's tables, explains of ``heard`` (n,), its gain free."""
         fixed = self._fixed(burst.waveform, table)
         seen, _, energy = matched_parts(heard, *fixed, burst.arrival_s, burst.beta, burst.kappa, 1)
-        return float(abs(seen[0]) ** 2 / energy)
+        return float(abs(seen[0]) ** 2 / energy[0])
 
     def _fixed(self, w: Waveform, table: Complexes) -> tuple[Complexes, float, float, float, float, float, float]:
         """What the kernels ask of a burst and of the samples, whatever the burst does."""

@@ -200,10 +200,11 @@ def _peak(
         best[max(0, at - close) : max(0, at + close + 1)] = 0.0
     column = int(np.argmax(best))
     elsewhere = np.concatenate([best[: max(0, column - half)], best[column + half + 1 :]])
-    here, later, faster = _summit(baseband, bank, first + column, int(row[column]))
+    # between rows an echo at another rate draws a summit aside; the fit finds it
+    here, later = _summit(baseband, bank, first + column, int(row[column]))
     return Peak(
         start_s=start_s + (first + column + later) / band.rate_hz + bank.lead_s,
-        range_rate_mps=float(bank.range_rate_mps[row[column]]) + faster * bank.step,
+        range_rate_mps=float(bank.range_rate_mps[row[column]]),
         power=here if best[column] > 0 else 0.0,
         second=float(np.max(elsewhere, initial=0.0)),
         noise=max(noise, 1e-30),
@@ -217,24 +218,21 @@ def _apart(values: NDArray[np.complex64]) -> NDArray[np.float32]:
     return np.ascontiguousarray(values.view(np.float32).reshape(-1, 2).T)
 
 
-def _summit(baseband: NDArray[np.complexfloating], bank: Bank, delay: int, row: int) -> tuple[float, float, float]:
-    """Correlation power at a cell, and how far from it the summit is: parts of a delay and of a row, half at most."""
+def _summit(baseband: NDArray[np.complexfloating], bank: Bank, delay: int, row: int) -> tuple[float, float]:
+    """Correlation power at a cell, and by how much of a delay, half at most, its summit comes later."""
     length = bank.replicas.shape[1]
 
-    def height(j: int, n: int) -> float:
-        if not (0 <= j < len(bank.replicas) and 0 <= n):
-            return np.inf  # not to be known: the cell's middle stands
+    def height(n: int) -> float:
         heard = baseband[n : n + length]
-        return float(abs(np.vdot(bank.replicas[j, : len(heard)], heard)))
+        return float(abs(np.vdot(bank.replicas[row, : len(heard)], heard)))
 
-    here = height(row, delay)
-    later = _vertex(height(row, delay - 1), here, height(row, delay + 1))
-    return here**2, later, _vertex(height(row - 1, delay), here, height(row + 1, delay))
+    here = height(delay)
+    return here**2, _vertex(height(delay - 1), here, height(delay + 1)) if delay > 0 else 0.0
 
 
 def _vertex(before: float, here: float, after: float) -> float:
     """Where a parabola through three equidistant values peaks, from the middle one, half a step at most."""
-    bend = 2 * here - before - after  # −∞ at an edge
+    bend = 2 * here - before - after
     return float(np.clip(0.5 * (after - before) / bend, -0.5, 0.5)) if bend > 0 else 0.0
 
 

@@ -60,6 +60,12 @@ COLLAPSED = 0.1
 ECHO_POWER = 10 ** (-26 / 10)
 """Weaker echoes than this share of a burst's strongest path are not looked for."""
 
+WOBBLE = 12.0
+"""Power over the noise that leaving its parabola must explain more of a burst; noise alone explains 2 on average."""
+
+MOSTLY = 0.6
+"""Of what is left over the noise, that must be explained by it."""
+
 MOST_PATHS = 12
 """Of one burst."""
 
@@ -170,6 +176,7 @@ class Separation:
         self._settle()
         if self._disturbed():
             self._straighten()
+            self._follow()
             self._leave_out_clicks()
             self._take_crowd()
             self._prune()
@@ -186,6 +193,22 @@ class Separation:
         if any([self.joint.straighten(int(i)) for i in loudest_first]):  # of all, not up to the first that changed
             self._settled = False
             self._settle()
+
+    def _follow(self) -> None:
+        """Let bursts leave their parabolas, if that explains most of what is left: echoes and clicks would not."""
+        if not (self.sounds and self._disturbed()):
+            return
+        first, last = self.sounding()
+        excess = float(np.sum(np.abs(self.joint.residual[first:last]) ** 2)) - (last - first) * self.floor
+        noise = self.floor * self.band.whiteness
+        found = [(i, *self.joint.wobble(i)) for i in range(len(self.sounds))]
+        real = [(i, phase, gained) for i, phase, gained in found if gained > WOBBLE * noise]
+        if sum(gained for _, _, gained in real) < MOSTLY * excess:
+            return
+        for i, phase, _ in real:
+            self.joint.follow(i, phase)
+        self._settled = False
+        self._settle()
 
     def _leave_out_clicks(self) -> None:
         """Set aside clicks and drop-outs."""
