@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank, make_bank, velocity_step_mps
 from sonofix.acquire.baseband import Band, band_limited, design_band
-from sonofix.acquire.search import Peak, near, profile, search, search_near
+from sonofix.acquire.search import Peak, mean_near, near, profile, search, search_near
 from sonofix.signals import codes
 from sonofix.signals.interpolate import sample
 from sonofix.signals.waveform import keyed_waveform
@@ -155,3 +155,14 @@ def test_nothing_to_search_gives_nothing() -> None:
     assert look(samples, opens_s=5.0, closes_s=6.0) is None
     assert look(samples, opens_s=-2.0, closes_s=-1.0) is None
     assert found(samples).power == 0.0
+
+
+def test_power_as_a_code_hears_it(rng: np.random.Generator) -> None:
+    """Noise has its own power; faint echoes of the code round a burst have more than their power tells."""
+    quiet = noise(rng, 1e-3)
+    around = (0.06, 0.0, 8e-3)
+    # a hundred or so independent cells
+    assert mean_near(quiet, 0.0, BANK, BAND, *around) == pytest.approx(1e-3, rel=0.4)
+    echoes = quiet + sum(heard(BANK, BAND, 0.06 + delay, 0.0, 0.02) for delay in (2e-3, -3e-3, 5e-3))
+    left = float(np.mean(np.abs(echoes) ** 2))
+    assert mean_near(echoes, 0.0, BANK, BAND, *around) > 3 * left

@@ -171,6 +171,25 @@ def near(
     return best, row
 
 
+def mean_near(
+    baseband: NDArray[np.complexfloating],
+    start_s: float,
+    bank: Bank,
+    band: Band,
+    begins_s: float,
+    range_rate_mps: float,
+    reach_s: float,
+) -> float:
+    """Mean correlation power of one emitter's replica within ±``reach_s`` of where a burst begins.
+
+    That of noise is its power per sample; echoes of the same code, too faint to be told apart, have more.
+    """
+    first, count = delays(baseband, start_s, bank, band, begins_s - reach_s, begins_s + reach_s)
+    row = int(np.argmin(np.abs(bank.range_rate_mps - range_rate_mps)))
+    power, _ = near(baseband, first, max(count, 1), bank, row, row + 1, band.rate_hz)
+    return float(np.mean(power))
+
+
 def delays(
     baseband: NDArray[np.complexfloating], start_s: float, bank: Bank, band: Band, opens_s: float, closes_s: float
 ) -> tuple[int, int]:

@@ -20,7 +20,7 @@ from sonofix.acquire.baseband import Band
 from sonofix.acquire.clicks import find_clicks
 from sonofix.acquire.refine import FRESH_RAD, STALE_RAD, Burst, Joint
 from sonofix.acquire.report import detection_of
-from sonofix.acquire.search import Peak, search, search_near
+from sonofix.acquire.search import Peak, mean_near, search, search_near
 from sonofix.acquire.tones import MARGIN_S, Tone, refit
 from sonofix.records import Detection, Prediction
 
@@ -65,6 +65,9 @@ WOBBLE = 12.0
 
 MOSTLY = 0.6
 """Of what is left over the noise, that must be explained by it."""
+
+AROUND_S = 8e-3
+"""Before and after a burst, in which its early echoes fall: some 3 m of way."""
 
 MOST_PATHS = 12
 """Of one burst."""
@@ -449,6 +452,8 @@ class Separation:
         out = []
         noise = self.joint.noise()
         covariances = self.joint.covariances(noise)
+        # the faintest echoes stay in what is left, and their own code hears them better than it hears noise
+        echoes = len(self.sounds) > len({s.bank.emitter for s in self.sounds})
         for bank in self.banks:
             own = [i for i, s in enumerate(self.sounds) if s.bank is bank]
             if not own:
@@ -460,17 +465,24 @@ class Separation:
             first = min(weighty, key=lambda i: self.joint.bursts[i].arrival_s)
             if self._whole(first):
                 bursts = [self.joint.bursts[i] for i in own]
+                louder = max(1.0, self._heard_around(first) / float(noise[first])) if echoes else 1.0
                 out.append(
                     detection_of(
                         bank.emitter,
                         self.joint.bursts[first],
                         bursts,
-                        covariances[first],
+                        covariances[first] * louder,
                         float(noise[first]) / self.band.whiteness,
                         receiver,
                     )
                 )
         return out
+
+    def _heard_around(self, i: int) -> float:
+        """Power per sample of what is left around burst i, as its code hears it."""
+        bank, rate_mps = self.sounds[i].bank, self.joint.bursts[i].beta * self.sound_speed_mps
+        place = self.begins_s(i), rate_mps, AROUND_S
+        return mean_near(self.joint.residual, self.start_s, bank, self.band, *place)
 
     def reach_s(self, expected: Prediction) -> float:
         """How far from its predicted arrival a burst is looked for."""
