@@ -124,6 +124,16 @@ def test_is_frozen():
         Site.model_validate(RAW).air.temperature_c = 25.0
 
 
+def test_beacons_of_two_zones_may_share_a_code():
+    raw = changed("beacon", 1, "code", to=RAW["beacon"][0]["code"])
+    for zones in (("n", "n"), ("n", None), (None, None)):
+        for beacon, zone in zip(raw["beacon"], zones, strict=False):
+            beacon["zone"] = zone
+        assert any("same code" in str(m) for m in mistakes(raw))
+    raw["beacon"][0]["zone"], raw["beacon"][1]["zone"] = "n", "s"
+    assert Site.model_validate(raw).beacons[1].zone == "s"
+
+
 @pytest.mark.parametrize(
     ("path", "value", "where", "says"),
     [

@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from sonofix.acquire.epochs import Schedule, Window, reach_s, screen
 from sonofix.acquire.explain import Hearing, insight
 from sonofix.acquire.plan import acquire, make_plan
+from sonofix.acquire.roll import Roll
 from sonofix.locate.fix import fix
+from sonofix.locate.sound_speed import SoundSpeed
+from sonofix.locate.whose import tell_whose
 from sonofix.ranging import range_epoch, stated_epochs
 from sonofix.records import (
     Acquisition,
@@ -160,6 +163,7 @@ class Street:
         self.site = site
         self.rate_hz = rate_hz
         self.follower = Follower(site, Motion(), site.free_running)
+        self.air = SoundSpeed()
         self._start = start
         self._written_s: float | None = None
 
@@ -167,7 +171,7 @@ class Street:
         """Take in the ranges of one epoch."""
         if self._start is not None:
             self._place(self._start, epoch.sync_s)
-        fixes = tuple(fix(epoch, self.site, v.id) for v in self.site.vehicles)
+        epoch, fixes, told = self.air.take(epoch, lambda e: tuple(fix(e, self.site, v.id) for v in self.site.vehicles))
         before = self.follower.belief
         estimates, used, events = self.follower.step(epoch, fixes)
         believed = used.copy()
@@ -182,7 +186,7 @@ class Street:
                     offset[asked] = found.clock_offset_m
         if self.rate_hz is not None:
             estimates = self._between(before, estimates)
-        return Step(epoch, fixes, estimates, flags + events, believed & np.isfinite(offset), offset)
+        return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
 
     def _place(self, start: Table, time_s: float) -> None:
         """Put vehicles where start.csv says, once."""
@@ -258,15 +262,20 @@ class Receiver:
             raise ValueError("no [[microphone]] names a channel of the capture: add channel = 0, 1, …")
         speeds = [v.max_speed_mps or DEFAULT_MAX_SPEED_MPS for v in site.vehicles] or [0.0]
         sounding = any(b.vehicle for b in site.coded_beacons) and any(m.vehicle for m in self._microphones)
+        reach = reach_s(site, self.sound_speed_mps)
+        self._roll = Roll(site, waveforms, reach)
         self._plan = make_plan(
-            waveforms, sample_rate_hz, self.sound_speed_mps, max(speeds) * (2.0 if sounding else 1.0)
+            self._roll.named(), sample_rate_hz, self.sound_speed_mps, max(speeds) * (2.0 if sounding else 1.0)
         )
         known, regular = site.schedule.synchronised, not site.free_running
-        self._schedule = Schedule(site.schedule.period_s, reach_s(site, self.sound_speed_mps), sync_s, known, regular)
+        self._schedule = Schedule(site.schedule.period_s, reach, sync_s, known, regular)
         self._street = Street(site, start, rate_hz)
         self._offsets_s = {b.id: b.offset_s + b.delay_s for b in site.coded_beacons}
         lags = [m.delay_s for m in self._microphones]
         self._earliest_s = min(self._offsets_s.values()) + min(lags)
+        if self._roll.short:
+            # bursts that began before an epoch sound on within it
+            self._earliest_s -= self._plan.burst_s
         self._latest_s = max(self._offsets_s.values()) + max(lags)
         self._samples = np.zeros((0, 0), np.float32)
         self._first = 0  # index of _samples[0] in the stream; below 0 for the silence before it
@@ -294,12 +303,12 @@ class Receiver:
             if complete and wanted_s > end_s:
                 break
             shortest_s = min(w.duration_s for w in self.waveforms.values())
-            if not complete and window.opens_s + self._earliest_s + shortest_s > end_s:
+            if not complete and window.opens_s + min(self._offsets_s.values()) + shortest_s > end_s:
                 break
             begin = max(0, round((window.opens_s + self._earliest_s - self._plan.margin_s) * rate) - self._first)
             end = round(wanted_s * rate) - self._first
             first = self._first + begin
-            heard, flags = self._hear(window, self._samples[begin:end], first)
+            heard, flags, untold = self._hear(window, self._samples[begin:end], first)
             starts_s = np.array(
                 [
                     d.arrival_s
@@ -312,9 +321,9 @@ class Receiver:
             if window.seeking:
                 self._schedule.found(starts_s)
                 if not heard:
-                    yield self._step(window, heard, flags)
+                    yield self._step(window, heard, flags, untold)
             else:
-                yield self._step(window, heard, flags)
+                yield self._step(window, heard, flags, untold)
                 self._schedule.done(starts_s)
             self._forget()
 
@@ -330,38 +339,47 @@ class Receiver:
 
     def _hear(
         self, window: Window, samples: NDArray[np.float32], first: int
-    ) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
-        """Acquire every microphone's bursts: warm where a track says what to expect, cold where that fails."""
+    ) -> tuple[tuple[Detection, ...], tuple[str, ...], bool]:
+        """Acquire every microphone's bursts: warm where a track says what to expect, cold where that fails.
+
+        Says too whether any was searched cold, so that whose its bursts are is to be told.
+        """
         flags: list[str] = []
+        untold = False
         heard: list[Detection] = []
         for microphone in self._microphones:
             channel, odd = screen(samples[:, microphone.channel], self._plan.sample_rate_hz)
             flags += [f"microphone {microphone.id}: {text}" for text in odd]
-            windows = {
-                emitter: (window.opens_s + offset + microphone.delay_s, window.closes_s + offset + microphone.delay_s)
-                for emitter, offset in self._offsets_s.items()
-                if self.site.beacon(emitter).vehicle is None or self.site.beacon(emitter).vehicle != microphone.vehicle
-            }
-            expected = {} if window.seeking else self._expect(window, microphone.id, list(windows))
-            found, notes = acquire(self._plan, channel, first, microphone.id, windows, expected)
-            repeated = bool(expected) and len(found) < 0.7 * self._heard_last / len(self._microphones)
+            emitters = self._roll.listens(microphone.vehicle)
+            expected = {} if window.seeking else self._expect(window, microphone.id, emitters)
+            call = self._roll.call(window, microphone.delay_s, emitters, expected)
+            found, notes = acquire(self._plan, channel, first, microphone.id, call.windows, call.predictions)
+            own = tuple(self._roll.heard(found, call))
+            # where only the track tells whose bursts are whose, it is given up for none at all alone
+            few = 1 if self._roll.ambiguous else 0.7 * self._heard_last / len(self._microphones)
+            repeated = bool(expected) and len(own) < few
             if repeated:
-                expected = {}
-                found, notes = acquire(self._plan, channel, first, microphone.id, windows)
+                call = self._roll.call(window, microphone.delay_s, emitters, {})
+                found, notes = acquire(self._plan, channel, first, microphone.id, call.windows)
+                own = tuple(self._roll.heard(found, call))
             if self._on_hearing is not None:
                 why = "the warm search heard too little" if repeated else "no track says where to look"
-                sent_s = {e: window.sync_s + self._offsets_s[e] + microphone.delay_s for e in windows}
-                given = (microphone.id, channel, first, windows, expected)
-                self._on_hearing(Hearing(self._plan, *given, sent_s, odd, "" if expected else why))
-            heard += found
+                given = (microphone.id, channel, first, call.windows, call.predictions)
+                sent_s = self._roll.sent_s(window, microphone.delay_s, call)
+                self._on_hearing(Hearing(self._plan, *given, sent_s, odd, "" if call.predictions else why))
+            untold |= not call.predictions
+            heard += own
             flags += [f"microphone {microphone.id}: {text}" for text in notes]
         self._heard_last = len(heard)
-        return tuple(heard), tuple(flags)
+        return tuple(heard), tuple(flags), untold and self._roll.ambiguous
 
-    def _step(self, window: Window, heard: tuple[Detection, ...], flags: tuple[str, ...]) -> Step:
+    def _step(self, window: Window, heard: tuple[Detection, ...], flags: tuple[str, ...], untold: bool) -> Step:
         acquired = Acquisition(window.index, window.sync_s, heard, flags)
         ranges = range_epoch(self.site, self.waveforms, acquired, self.sound_speed_mps, self.sound_speed_sd_mps)
         events = tuple(Event(window.sync_s, "", "samples", text) for text in flags)
+        if untold and len(ranges):
+            ranges, told = tell_whose(ranges, self.site, self._roll.whose)
+            events += (Event(window.sync_s, "", "whose", told),) if told else ()
         before = self._street.follower.belief
         step = self._street.walk(ranges, events)
         self._watch(before, self._street.follower.belief)
@@ -382,10 +400,8 @@ class Receiver:
         microphone = self.site.microphone(receiver)
         middle_s = {e: self._offsets_s[e] + self.waveforms[e].duration_s / 2 for e in emitters}
         aged = predict(belief, window.sync_s + float(np.mean(list(middle_s.values()))) + 0.03, self._motion(window))
-        range_m, range_sd, rate, rate_sd = expectations(
-            aged, self.site, [(e, receiver) for e in emitters], self.sound_speed_mps
-        )
-        c = self.sound_speed_mps
+        c = self._street.air.sound_speed_mps or self.sound_speed_mps
+        range_m, range_sd, rate, rate_sd = expectations(aged, self.site, [(e, receiver) for e in emitters], c)
         common = not self.site.clock_known
         offset_m = float(belief.mean[-2]) if common else 0.0
         # a free-running source keeps no time from burst to burst, only its speed carries over

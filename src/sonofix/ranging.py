@@ -7,10 +7,11 @@ was sent. Where the clock is not common to both ends, all ranges of an epoch sha
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from sonofix.records import Acquisition, RangeEpoch, RangeRows, Waveform
+from sonofix.records import Acquisition, Floats, RangeEpoch, RangeRows, Waveform
 from sonofix.site import Site
 
 RANGES_WITHOUT_SD_M = 0.1
@@ -36,13 +37,15 @@ def range_epoch(
     delay_s = np.array([site.microphone(d.receiver).delay_s for d in heard])
     time_s = np.array([d.arrival_s for d in heard]) - delay_s
     sent_s = acquired.sync_s + np.array([b.offset_s + b.delay_s + waveforms[b.id].duration_s / 2 for b in beacons])
+    if any(d.periods_ago for d in heard):
+        assert site.schedule is not None
+        sent_s -= float(site.schedule.period_s or 0.0) * np.array([d.periods_ago for d in heard])
     range_m = sound_speed_mps * (time_s - sent_s)
     own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2
     rate = sound_speed_mps * (1.0 - np.array([d.time_scale for d in heard]))
     rate_sd = sound_speed_mps * np.sqrt([d.covariance[1, 1] for d in heard])
     common_clock = not site.clock_known
-    # with an unknown offset inside, the flight is not known: the spread of ranges is what the speed's error scales
-    flight_m = range_m - range_m.min(initial=np.inf) if common_clock and len(heard) else range_m
+    flight_m = flights_m(range_m, common_clock)
     shared = (sound_speed_sd_mps / sound_speed_mps) ** 2 * np.outer(flight_m, flight_m)
     return RangeEpoch(
         index=acquired.index,
@@ -58,6 +61,32 @@ def range_epoch(
         clock="common" if common_clock else "known",
         sound_speed_mps=sound_speed_mps,
         flags=acquired.flags,
+        sound_speed_sd_mps=sound_speed_sd_mps,
+    )
+
+
+def flights_m(range_m: Floats, common_clock: bool) -> Floats:
+    """Return what a wrong sound speed scales: ranges or, with an unknown offset inside, what each has beyond the least.
+
+    That the least one's flight is scaled as well is the offset's to take.
+    """
+    return range_m - range_m.min() if common_clock and len(range_m) else range_m
+
+
+def with_sound_speed(epoch: RangeEpoch, sound_speed_mps: float, sound_speed_sd_mps: float) -> RangeEpoch:
+    """Return the ranges that the same delays are at another sound speed, of another deviation."""
+    scale, common_clock = sound_speed_mps / epoch.sound_speed_mps, epoch.clock == "common"
+    before = flights_m(epoch.range_m, common_clock) * (epoch.sound_speed_sd_mps / epoch.sound_speed_mps)
+    after = flights_m(epoch.range_m, common_clock) * (sound_speed_sd_mps / epoch.sound_speed_mps)
+    rate, rate_sd = epoch.range_rate_mps, epoch.range_rate_sd_mps
+    return replace(
+        epoch,
+        range_m=scale * epoch.range_m,
+        covariance_m2=scale**2 * (epoch.covariance_m2 - np.outer(before, before)) + np.outer(after, after),
+        range_rate_mps=None if rate is None else scale * rate,
+        range_rate_sd_mps=None if rate_sd is None else scale * rate_sd,
+        sound_speed_mps=sound_speed_mps,
+        sound_speed_sd_mps=sound_speed_sd_mps,
     )
 
 

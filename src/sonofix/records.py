@@ -163,6 +163,8 @@ class Detection:
     snr_db : float
         Mean burst power over the noise power in the search band.
     paths : tuple of Path
+    periods_ago : int
+        In which period before the epoch's it was sent: above 0 where epochs are shorter than the flight.
     """
 
     emitter: str
@@ -173,6 +175,7 @@ class Detection:
     amplitude: float
     snr_db: float
     paths: tuple[Path, ...] = ()
+    periods_ago: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,6 +211,8 @@ class RangeEpoch:
     sound_speed_mps : float
         The speed that made ranges of the delays.
     flags : tuple of str
+    sound_speed_sd_mps : float
+        Its deviation, which ``covariance_m2`` holds as what all ranges share; 0: taken as it is.
     """
 
     index: int
@@ -223,6 +228,7 @@ class RangeEpoch:
     clock: Literal["known", "common"]
     sound_speed_mps: float
     flags: tuple[str, ...] = ()
+    sound_speed_sd_mps: float = 0.0
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -257,6 +263,8 @@ class Fix:
         Measured less computed range; NaN where no position was found.
     mirror_m : float64 (3,) or None
         The other solution where geometry leaves two.
+    sound_speed_mps, sound_speed_sd_mps : float or None
+        What the ranges say of the sound speed, with the epoch's own as the prior; None where that is taken as it is.
     """
 
     time_s: float
@@ -276,6 +284,8 @@ class Fix:
     used: NDArray[np.bool_]
     residual_m: Floats
     mirror_m: Floats | None = None
+    sound_speed_mps: float | None = None
+    sound_speed_sd_mps: float | None = None
 
     def sd(self, state: str) -> float | None:
         """Return the standard deviation of a state by name, None where it is not estimated."""
@@ -642,3 +652,209 @@ class Insight:
             if why[alike]:
                 lines.append(f"Paths: {why[alike]} that were tried proved {reason} when all else was taken away.")
         return lines
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Walls:
+    """Walls and obstacles of a floor plan, seen from above: what sound does not pass.
+
+    Attributes
+    ----------
+    start_m, end_m : float64 (k, 2)
+        Ends of each straight piece.
+    height_m : float64 (k,)
+        Its top; infinite where it reaches the ceiling. All stand on the floor.
+    solid : int64 (k,)
+        Number of the obstacle whose outline (or hole) the piece belongs to; −1: a wall on its own.
+    """
+
+    start_m: Floats
+    end_m: Floats
+    height_m: Floats
+    solid: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Return the number of pieces."""
+        return len(self.height_m)
+
+    @classmethod
+    def none(cls) -> Walls:
+        """Return a floor plan without walls."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quality:
+    """What a layout promises at each place of a level; grids are indexed ``[j, i]`` for ``(x_m[i], y_m[j])``.
+
+    Attributes
+    ----------
+    x_m, y_m : float64 (nx,), (ny,)
+    level_m : float
+        Height of the map: that of what listens (or of what sounds, where the vehicle does).
+    floor : bool (ny, nx)
+        Whether one can be there: not inside an obstacle. Elsewhere all else is 0 or NaN.
+    heard : int64 (ny, nx)
+        Beacons heard (fixed microphones that hear, where the vehicle sounds).
+    hdop, vdop : float64 (ny, nx)
+        Of unit range deviations; NaN where there is no fix. ``vdop`` is None where the level is known.
+    sd_m, sd_z_m : float64 (ny, nx)
+        Expected deviation of the position, √(σx² + σy²), and of the height; NaN and None likewise.
+    fault_m : float64 (ny, nx)
+        Smallest fault of one range that is detected whichever range it is in; infinite where none is surely detected,
+        NaN where there is no fix.
+    """
+
+    x_m: Floats
+    y_m: Floats
+    level_m: float
+    floor: NDArray[np.bool_]
+    heard: NDArray[np.int64]
+    hdop: Floats
+    vdop: Floats | None
+    sd_m: Floats
+    sd_z_m: Floats | None
+    fault_m: Floats
+
+    @property
+    def fix(self) -> NDArray[np.bool_]:
+        """Places with a fix (ny, nx)."""
+        return np.isfinite(self.sd_m)
+
+    def share(self, where: NDArray[np.bool_]) -> float:
+        """Share of the floor where something holds, 0 … 1."""
+        return float(np.mean(where[self.floor])) if self.floor.any() else 0.0
+
+    def over_floor(self, values: Floats, percent: float) -> float:
+        """Percentile over the whole floor; places without a value count as infinite."""
+        known = np.where(np.isfinite(values), values, np.inf)[self.floor]
+        return float(np.percentile(known, percent, method="higher")) if known.size else float("inf")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurveyedBeacon:
+    """One fixed beacon before and after a survey.
+
+    Attributes
+    ----------
+    id : str
+    before_m, position_m : float64 (3,)
+        As the site file has it, and as found.
+    before_sd_m : float or None
+        Of the guess, per axis; 0: known, and not moved; None: the guess was not looked at.
+    covariance_m2 : float64 (3, 3)
+        Of the place found within the survey's frame (`Survey.gauge`); zero where it is known.
+    bias_m, bias_sd_m : float or None
+        How much longer its ranges are than the ways, by a delay that the site file does not state; None where each
+        pair has its own, or none was sought.
+    heard, used : int
+        Rows.
+    residual_m : float
+        Root mean square of its used ranges' residuals; NaN where there are none.
+    mirrored : bool
+        Whether its image on the other side of the microphones' level fits alike.
+    """
+
+    id: str
+    before_m: Floats
+    position_m: Floats
+    before_sd_m: float | None
+    covariance_m2: Floats
+    bias_m: float | None
+    bias_sd_m: float | None
+    heard: int
+    used: int
+    residual_m: float
+    mirrored: bool = False
+
+    @property
+    def sd_m(self) -> Floats:
+        """Deviations (3,) along the axes."""
+        return np.sqrt(np.diag(self.covariance_m2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenDirection:
+    """A direction, of one beacon or of several together, that a drive does not tell.
+
+    ``move_m`` (beacons, 3): how the beacons move along it, of root sum square 1, in the order of `Survey.beacons`;
+    ``drive_sd_m``: what the drive alone leaves of it, infinite where it says nothing; ``sd_m``: with what was known
+    before; ``text`` says it in plain words.
+    """
+
+    move_m: Floats
+    drive_sd_m: float
+    sd_m: float
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairBias:
+    """How much longer the ranges of an emitter–receiver pair are than their ways; ``emitter`` is empty for any."""
+
+    emitter: str
+    receiver: str
+    bias_m: float
+    sd_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """Where beacons are, by a drive.
+
+    Attributes
+    ----------
+    status : "ok", "open" (some directions stay unknown) or "failed"; ``remedy`` says in one sentence what would help
+    beacons : tuple of SurveyedBeacon
+        The fixed ones, as the site file orders them.
+    covariance_m2 : float64 (3 B, 3 B)
+        Of all their places jointly, within the frame that ``gauge`` describes.
+    gauge : str
+        What the frame rests on.
+    frame_sd : mapping from x_m, y_m, z_m, roll_rad, pitch_rad, yaw_rad to float
+        How well the frame of guesses is known, for what no data tell; empty where known beacons hold the frame.
+    mirror : str
+        What is undecided between mirror images; empty where nothing is.
+    open : tuple of OpenDirection
+        Weakest first.
+    pairs : tuple of PairBias
+        Where each pair has its own bias; else those of fixed microphones.
+    sound_speed_mps, sound_speed_sd_mps : float
+    sound_speed_prior_mps, sound_speed_prior_sd_mps : float
+        What it began with, a deviation of 0: taken as stated.
+    clock_offset_m, clock_drift_mps : float or None
+        Of an unknown common clock, at the recording's time 0.
+    drive : mapping from vehicle to float64 (n, 4)
+        Time and place of each epoch, where its motion is followed.
+    rows, excluded : int
+    before_m, after_m, rate_after_mps : float
+        Root mean squares of residuals: of ranges as the site file would have them (vehicles solved for), of used ranges
+        and of used range rates (NaN where there are none).
+    inflation : float
+        Factor on all deviations, since residuals are larger than stated ones; 1 where they are not.
+    events : tuple of Event
+    """
+
+    status: Literal["ok", "open", "failed"]
+    remedy: str
+    beacons: tuple[SurveyedBeacon, ...]
+    covariance_m2: Floats
+    gauge: str
+    frame_sd: Mapping[str, float]
+    mirror: str
+    open: tuple[OpenDirection, ...]
+    pairs: tuple[PairBias, ...]
+    sound_speed_mps: float
+    sound_speed_sd_mps: float
+    sound_speed_prior_mps: float
+    sound_speed_prior_sd_mps: float
+    clock_offset_m: float | None
+    clock_drift_mps: float | None
+    drive: Mapping[str, Floats]
+    rows: int
+    excluded: int
+    before_m: float
+    after_m: float
+    rate_after_mps: float
+    inflation: float
+    events: tuple[Event, ...]

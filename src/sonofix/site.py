@@ -264,7 +264,8 @@ class Beacon(_Section):
     """`[[beacon]]`: an emitter, fixed at `position_m` or at `lever_arm_m` on a vehicle.
 
     `position_sd_m` above 0 marks a guess; `offset_s` is when it bursts after the sync command; `delay_s` how much later
-    than commanded the sound leaves it. Keys of `[signal]` given here override that section.
+    than commanded the sound leaves it. Beacons of different `zone`s, out of each other's reach, may send the same code.
+    Keys of `[signal]` given here override that section.
     """
 
     id: Id
@@ -275,6 +276,7 @@ class Beacon(_Section):
     offset_s: Number = 0.0
     delay_s: Number = 0.0
     code: Code | None = None
+    zone: Id | None = None
     carrier_hz: Positive | None = None
     modulation: Modulation | None = None
     cycles_per_chip: Positive | None = None
@@ -466,9 +468,16 @@ def _code_rules(beacons: list[Callable[[str], Any]], schedule: object, signal: o
         if isinstance(offset, int | float) and isinstance(period, int | float) and 0 < period <= abs(offset):
             yield ("beacon", i, "offset_s"), offset, f"bursts start within their period of {period} s"
     for (i, a), (k, b) in combinations(coded, 2):
+        if _in_two_zones(a, b):
+            continue
         if (_code_key(a("code")), repr(a("carrier_hz"))) == (_code_key(b("code")), repr(b("carrier_hz"))):
-            remedy = f"beacon {i + 1} ({a('id')}) sends the same code; every beacon needs its own"
+            remedy = f"beacon {i + 1} ({a('id')}) sends the same code; every beacon of a zone needs its own"
             yield ("beacon", k, "code"), b("id"), remedy
+
+
+def _in_two_zones(a: Callable[[str], Any], b: Callable[[str], Any]) -> bool:
+    """Whether two beacons may share a code: both stand still, each in a zone of its own."""
+    return None not in (a("zone"), b("zone")) and a("zone") != b("zone") and not (a("vehicle") or b("vehicle"))
 
 
 def _join(ids: list[object]) -> str:

@@ -16,7 +16,7 @@ SHARE = 0.15
 
 def runs(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """First and past-the-last index (k, 2) of each run of True."""
-    return np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]))).reshape(-1, 2)
+    return np.flatnonzero(np.diff(np.pad(mask, 1))).reshape(-1, 2)
 
 
 def find_clicks(left: NDArray[np.complexfloating], burst: float) -> NDArray[np.int64]:

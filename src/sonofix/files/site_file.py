@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from sonofix import site as models
 from sonofix.files.problem import Problem, RecordingError, did_you_mean
-from sonofix.site import Site
+from sonofix.site import Beacon, Site
 
 FILE_NAME = "site.toml"
 
@@ -132,7 +132,7 @@ def code_problems(site: Site, name: str = FILE_NAME) -> list[Problem]:
     from sonofix.signals.waveform import chips_of
 
     problems: list[Problem] = []
-    first: dict[tuple[bytes, float], str] = {}
+    first: dict[tuple[bytes, float], list[Beacon]] = {}
     for i, beacon in enumerate(site.beacons):
         field = f'beacon {i + 1} "{beacon.id}" code'
         try:
@@ -144,9 +144,12 @@ def code_problems(site: Site, name: str = FILE_NAME) -> list[Problem]:
         if chips is None:
             continue
         key = (chips.tobytes(), site.signal_of(beacon).carrier_hz)
-        if first.setdefault(key, beacon.id) != beacon.id:
-            remedy = f"makes the same chips as beacon {first[key]}; every beacon needs its own code"
+        before = first.setdefault(key, [])
+        same = next((b for b in before if beacon.zone is None or b.zone in (None, beacon.zone)), None)
+        if same is not None:
+            remedy = f"makes the same chips as beacon {same.id}; every beacon of a zone needs its own code"
             problems.append(Problem(name, field, None, remedy))
+        before.append(beacon)
     return problems
 
 

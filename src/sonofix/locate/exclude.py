@@ -7,10 +7,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.locate.integrity import FALSE_ALARM, threshold
 from sonofix.locate.rows import Rows, Solution
-
-FALSE_ALARM = 1e-5
-"""Of the χ² test, per epoch."""
+from sonofix.records import Floats
 
 MOST_PAIRS = 66
 """Pairs of rows tried as both faulty: all of twelve rows."""
@@ -20,6 +19,10 @@ MOST_ANEW = 12
 
 APART_SIGMA = 6.0
 """Two selections that both pass the test but put the vehicle this far apart leave the fault undecided."""
+
+
+MENDED = 1e-4
+"""Rows that agree worse than this once a row is left out have hardly been mended: two wrong ones may look like one."""
 
 
 def exclude(
@@ -38,6 +41,7 @@ def exclude(
     """
     if agrees(solver, len(rows), found[0].chi2) or len(rows) <= solver.needed + 1:
         return rows, found, True
+    tried: list[tuple[NDArray[np.int64], Floats, Floats, Floats]] = []
     for count in (1, 2):
         if len(rows) - count <= solver.needed or (count == 2 and len(rows) * (len(rows) - 1) // 2 > MOST_PAIRS):
             break
@@ -50,23 +54,34 @@ def exclude(
                 anew = solver.candidates(choices[i])
                 if anew and anew[0].chi2 < chi2[i]:
                     chi2[i], place_m[i] = anew[0].chi2, anew[0].position_m
-            order = np.argsort(chi2, kind="stable")
-        passing = [i for i in order if agrees(solver, len(rows) - count, float(chi2[i]))]
-        if passing:
-            best = passing[0]
-            again = solver.candidates(choices[best])
-            if again:
-                gap_m = np.linalg.norm(place_m[passing] - place_m[best], axis=1)
-                return choices[best], again, not np.any(gap_m > APART_SIGMA * deviation_m[best])
+        tried.append((choices, place_m, chi2, deviation_m))
+        mended = _mended(solver, choices, place_m, chi2, deviation_m, MENDED)
+        if mended is not None:
+            return mended
+    for choices, place_m, chi2, deviation_m in tried:
+        mended = _mended(solver, choices, place_m, chi2, deviation_m, FALSE_ALARM)
+        if mended is not None:
+            return mended
     return *_one_by_one(solver, rows, found), True
 
 
 def agrees(solver: Rows, count: int, chi2: float) -> bool:
     """Whether the misfit of so many rows is what their deviations allow (true where none is left over to tell)."""
-    from scipy.special import chdtri
+    return chi2 <= threshold(solver.degrees(count))
 
-    dof = solver.degrees(count)
-    return dof <= 0 or chi2 <= float(chdtri(dof, FALSE_ALARM))
+
+def _mended(
+    solver: Rows, choices: NDArray[np.int64], place_m: Floats, chi2: Floats, deviation_m: Floats, rate: float
+) -> tuple[NDArray[np.int64], list[Solution], bool] | None:
+    """Return the choice whose rows agree best, if they do at a false-alarm rate, and whether no rival gainsays it."""
+    best, degrees = int(np.argmin(chi2)), solver.degrees(choices.shape[1])
+    if not chi2[best] <= threshold(degrees, rate):
+        return None
+    again = solver.candidates(choices[best])
+    if not again:
+        return None
+    gap_m = np.linalg.norm(place_m[chi2 <= threshold(degrees)] - place_m[best], axis=1)
+    return choices[best], again, not np.any(gap_m > APART_SIGMA * deviation_m[best])
 
 
 def _leaving(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:

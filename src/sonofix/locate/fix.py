@@ -7,17 +7,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE, from_arm, link, open_arms
+from sonofix.geometry import POSE, Links, from_arm, link, open_arms
 from sonofix.locate.exclude import agrees, exclude
 from sonofix.locate.rows import Rows, Solution
 from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
+Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Two corners of a room."""
+
 FLAT_M = 0.01
 """Two heights whose middle fits every range within this, or its deviation, are one position with an open height."""
 
-AMBIGUOUS_CHI2 = 16.0
-"""Two solutions whose χ² differ by less are both believed: odds of e⁸ to one."""
+AMBIGUOUS_CHI2 = 28.0
+"""Two solutions whose χ² differ by less are both believed: wherever the two lie, noise prefers the wrong one by more
+with a probability of Q(√28) = 6e-8."""
 
 
 def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
@@ -39,7 +43,15 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         ``status`` tells an expected failure, with its remedy; nothing is raised for poor geometry.
     """
     who = [v.id for v in site.vehicles].index(vehicle)
-    solver = Rows(epoch, link(site, epoch.emitter, epoch.receiver), who, site.vehicles[who].z_m)
+    links, level_m = link(site, epoch.emitter, epoch.receiver), site.vehicles[who].z_m
+    return judged(epoch, links, who, vehicle, level_m, site.bounds_m, open_arms(site)[who])
+
+
+def judged(
+    epoch: RangeEpoch, links: Links, who: int, vehicle: str, level_m: float | None, bounds_m: Bounds | None, arm: Floats
+) -> Fix:
+    """Do as `fix`, with what it asks of a site looked up: ends of rows, level, room, the arm that no heading places."""
+    solver = Rows(epoch, links, who, level_m)
     rows, time_s = solver.rows, solver.time_s
     if len(rows) < solver.needed:
         text = f"{len(rows)} of {solver.needed} ranges; bring more beacons in reach or state what is known (z_m)"
@@ -61,7 +73,7 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         status, inflation = "inconsistent", misfit / solver.degrees(len(rows))
         remedy = "a range is wrong, but which cannot be told; bring more beacons in reach"
     rivals = [s for s in found[1:] if s.chi2 < best.chi2 + AMBIGUOUS_CHI2 * inflation]
-    best, mirror, undecided = _tell_apart(best, rivals, site, epoch, rows[kept])
+    best, mirror, undecided = _tell_apart(best, rivals, bounds_m, epoch, rows[kept])
     mirror_m = None if mirror is None else mirror.position_m.copy()
     if undecided:
         text = "two positions or headings fit alike; state the room's bounds_m or the vehicle's z_m, or move one beacon"
@@ -70,14 +82,19 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
     if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
         text = "the beacons in reach leave a direction open; spread them off one line or plane"
         return _failed(epoch, vehicle, time_s, "no-convergence", text)
-    if mirror is not None and site.bounds_m is None and solver.level_m is None:
+    hpl_m = vpl_m = None
+    if status == "ok":
+        hpl_m, vpl_m = solver.protection(kept, best, [s for s in found if s is not best], bounds_m)
+    if mirror is not None and bounds_m is None and solver.level_m is None:
         best, covariance = _between(best, mirror, covariance)
     states = tuple(POSE[i] for i in solver.components) + ("clock",) * solver.clock
     used = np.zeros(len(epoch), bool)
     used[rows[kept]] = True
+    speed_mps, speed_sd_mps = solver.sound_speed(kept, best) or (None, None)
     residual = np.full(len(epoch), np.nan)
     residual[rows], hdop, vdop = solver.look(kept, best)
-    position, covariance = _shift_to_origin(best, covariance * inflation, solver.open_arm + open_arms(site)[who])
+    arm = solver.open_arm + arm
+    position, covariance = _shift_to_origin(best, covariance * inflation, arm)
     return Fix(
         time_s=time_s,
         vehicle=vehicle,
@@ -91,16 +108,19 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
         covariance=covariance,
         hdop=hdop,
         vdop=vdop,
-        hpl_m=None,
-        vpl_m=None,
+        # a lever arm of open heading may point anywhere
+        hpl_m=None if hpl_m is None else hpl_m + 2.0 * float(np.hypot(*arm)),
+        vpl_m=vpl_m,
         used=used,
         residual_m=residual,
         mirror_m=mirror_m,
+        sound_speed_mps=speed_mps,
+        sound_speed_sd_mps=speed_sd_mps,
     )
 
 
 def _tell_apart(
-    best: Solution, rivals: list[Solution], site: Site, epoch: RangeEpoch, kept: NDArray[np.int64]
+    best: Solution, rivals: list[Solution], bounds_m: Bounds | None, epoch: RangeEpoch, kept: NDArray[np.int64]
 ) -> tuple[Solution, Solution | None, bool]:
     """Choose among solutions that fit alike by the room's bounds; say so where that does not decide.
 
@@ -108,13 +128,13 @@ def _tell_apart(
     """
     if not rivals:
         return best, None, False
-    if site.bounds_m is None:
+    if bounds_m is None:
         apart = best.position_m - rivals[0].position_m
         range_m = abs(float(np.median(epoch.range_m[kept])))
         seen_m = max(FLAT_M, float(np.median(np.sqrt(np.diag(epoch.covariance_m2)[kept]))))
         close = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * range_m) < seen_m
         return best, rivals[0], len(rivals) > 1 or not close
-    low, high = np.array(site.bounds_m)
+    low, high = np.array(bounds_m)
     inside = [s for s in [best, *rivals] if np.all(s.position_m >= low - 0.1) and np.all(s.position_m <= high + 0.1)]
     if len(inside) != 1:
         return best, rivals[0], True

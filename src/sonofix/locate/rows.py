@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import comb
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import SAME_ARM_M, Links, expected
-from sonofix.locate.dense import spread
+from sonofix.locate.dense import spread, whitener
+from sonofix.locate.integrity import RISK, levels, threshold
 from sonofix.locate.noise import CLOCK_SPEED_SD, row_noise
-from sonofix.locate.search import MOST, search, without
+from sonofix.locate.search import MOST, rivals, search, without
+from sonofix.locate.solve import misfit
+from sonofix.ranging import flights_m
 from sonofix.records import Floats, RangeEpoch
 
 UNKNOWN_SPEED_MPS = 1.0
@@ -153,6 +157,8 @@ class Rows:
         if epoch.range_rate_mps is not None:
             self._measured = np.concatenate([self.range_m, epoch.range_rate_mps[self.rows]])
         speed_sd, clock_sd = 0.0 if self.rates else UNKNOWN_SPEED_MPS, CLOCK_SPEED_SD * self._speed_mps * self.clock
+        self._speed_sd_mps = float(epoch.sound_speed_sd_mps)
+        self._flight_m = flights_m(epoch.range_m, self.clock)[self.rows]
         self._covariance = row_noise(epoch, links, self.rows, self._dt, speed_sd, clock_sd)
 
     @property
@@ -172,15 +178,11 @@ class Rows:
         LinAlgError
             If the covariance of rows is not positive.
         """
-        ends, dt, measured, covariance = self._ends, self._dt, self._measured, self._covariance
-        if len(rows) < len(dt):
-            both = np.concatenate([rows, rows + len(dt)]) if self.rates else rows
-            ends, dt = tuple(part[rows] for part in ends), dt[rows]
-            measured, covariance = measured[both], np.ascontiguousarray(covariance[both[:, None], both])
-        m, flat = len(measured), self.level_m is not None
+        kept, covariance = self._kept(rows)
+        m, flat = len(covariance), self.level_m is not None
         states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, m, len(self._index)))
         at = (
-            (ends, dt, measured),
+            kept,
             self._speed_mps,
             self.clock,
             covariance,
@@ -192,6 +194,14 @@ class Rows:
         if count < 0:
             raise np.linalg.LinAlgError("covariance_m2 is not positive definite; give every range a deviation above 0")
         return [Solution(states[i], float(chi2s[i]), jacobians[i]) for i in range(count)]
+
+    def _kept(self, rows: NDArray[np.int64]) -> tuple[tuple, Floats]:
+        """Return a selection's rows as kernels take them, and their covariance."""
+        if len(rows) == len(self._dt):
+            return (self._ends, self._dt, self._measured), self._covariance
+        both = np.concatenate([rows, rows + len(self._dt)]) if self.rates else rows
+        ends = tuple(part[rows] for part in self._ends)
+        return (ends, self._dt[rows], self._measured[both]), np.ascontiguousarray(self._covariance[both[:, None], both])
 
     def without(self, choices: NDArray[np.int64], found: Solution) -> tuple[Floats, Floats, Floats]:
         """Solve again from a solution with each choice (q, p) of rows alone.
@@ -218,3 +228,77 @@ class Rows:
         """Covariance (k, k) of what is solved for; None where it leaves a direction open."""
         out = np.empty((len(self._index),) * 2)
         return out if spread(found.jacobian, out) else None
+
+    def sound_speed(self, kept: NDArray[np.int64], found: Solution) -> tuple[float, float] | None:
+        """Sound speed and its deviation by the rows kept, with the epoch's own as the prior; None where that is exact.
+
+        Its error scales all flights alike and is part of their covariance; what the residuals tell of it is the best
+        linear unbiased prediction (Henderson, Biometrics 31(2), 1975, eq 3.9), as if it had been one more unknown.
+        """
+        if not self._speed_sd_mps:
+            return None
+        (rows, covariance), m = self._kept(kept), len(found.jacobian)
+        whiten, plain, miss, jacobian = np.empty((m, m)), np.empty(m), np.empty(m), np.empty_like(found.jacobian)
+        whitener(covariance, whiten)
+        misfit(rows, self._speed_mps, self.clock, whiten, self._index, found.state, plain, miss, jacobian)
+        # a metre a second more than taken makes ranges that much longer than measured
+        shown = whiten[:, : len(kept)] @ (-self._flight_m[kept] / self._speed_mps)
+        q = np.linalg.qr(jacobian)[0]
+        left = shown - q @ (q.T @ shown)
+        variance = self._speed_sd_mps**2
+        told = max(1.0 - variance * float(left @ left), 0.0)
+        return self._speed_mps + variance * float(shown @ miss), self._speed_sd_mps * float(np.sqrt(told))
+
+    def protection(
+        self, kept: NDArray[np.int64], found: Solution, others: list[Solution], bounds_m: tuple | None
+    ) -> tuple[float | None, float | None]:
+        """Horizontal and vertical protection level of a solution that passed the test with the rows kept.
+
+        At most one row is taken to be wrong beyond those left out, or as many as those: in range, rate or both. Where
+        a selection less one row fits a second place as well (a mirror image), the fault may have chosen between them:
+        the level then holds both places. Where it is so loose that ranges bend within its reach, the level holds what
+        it allows: there the linear model does not.
+
+        Returns
+        -------
+        hpl_m, vpl_m : float or None
+            None where integrity cannot be judged; vpl_m also where the level is known.
+        """
+        if len(kept) <= self.needed:
+            return None, None
+        covariance, left_out = self._kept(kept)[1], len(self._dt) - len(kept)
+        whiten = np.empty_like(covariance)
+        whitener(covariance, whiten)
+        groups, faults = np.arange(len(whiten)).reshape(-1, len(kept)).T, max(1, left_out)
+        hpl, vpl = levels(
+            found.jacobian,
+            whiten,
+            (0, 1),
+            2 if self.level_m is None else None,
+            groups=groups,
+            faults=faults,
+            selections=2 ** (left_out + 1) * comb(len(self._dt), left_out),
+        )
+        if not np.isfinite(hpl):
+            return None, None
+        room = np.array([[-np.inf] * 3, [np.inf] * 3] if bounds_m is None else bounds_m, float)
+        away, whole = np.zeros(4), threshold(self.degrees(len(kept)), RISK)
+        at = (self._speed_mps, self.clock, self._covariance, self._index, self.level_m is not None)
+        reach = float(np.sqrt(-2 * np.log(RISK)))
+        limit = threshold(max(self.degrees(len(kept) - 1), 1), RISK)
+        # at the end of this reach the nearest range has bent by the smallest deviation
+        near_m = max(float(np.abs(self.range_m[kept] - found.clock_m).min()), 0.1)
+        bend_m2 = 2.0 * near_m * float(np.sqrt(covariance.diagonal()[: len(kept)].min()))
+        rows = (self._ends, self._dt, self._measured)
+        rivals(rows, *at, float(self.level_m or 0.0), kept, found.state, limit, reach, bend_m2, room, away)
+        for other in others:
+            place = other.position_m
+            if other.chi2 <= whole and np.all(place >= room[0] - 0.1) and np.all(place <= room[1] + 0.1):
+                apart = np.abs(place - found.position_m)
+                away[:2] = np.maximum(away[:2], (np.hypot(apart[0], apart[1]), apart[2]))
+        if not np.isfinite(away[0]):
+            return None, None
+        hpl = max(hpl + float(away[0]), float(away[2]))
+        if vpl is None or not np.isfinite(vpl):
+            return hpl, None
+        return hpl, max(vpl + float(away[1]), float(away[3]))

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from sonofix.geometry import expected
-from sonofix.locate.dense import principal, whitener
+from sonofix.locate.dense import principal, spread, whitener
 from sonofix.locate.solve import alike, descend, misfit
 from sonofix.locate.start import MOST_STARTS, begin
 
@@ -19,6 +19,9 @@ YAW_STARTS = 12
 
 MOST = 2 * (MOST_STARTS + 1)
 """Solutions there may be: from each start and a mirror image, by two headings."""
+
+NEARLY_FLAT = 0.3
+"""Anchors that spread less across than this share of their widest spread may have nearly a mirror solution."""
 
 STEPS = 50
 """Of one descent at most."""
@@ -58,14 +61,15 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
     count, found = begin(anchors, measured[:n], flat, level_m, clock, begins), 0
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, len(index)))
     for b in range(MOST_STARTS + 1):
-        if b >= count and not (b == count and turns and found):
+        if b > count or (b == count and not found):
             break
         if b == count:
             # anchors nearly in one plane have nearly a mirror solution, which the linear start may have missed, or hit
             for axis in range(3):
                 begins[b, axis] = states[0, axis]
             begins[b, 3] = states[0, 8]
-            _mirror(begins[b], anchors, 2 if flat else 3)
+            if not mirror(begins[b], anchors, 2 if flat else 3) and not turns:
+                break
         if turns:
             _yaws(rows, c, clock, whiten, begins[b], yaws)
         for k in range(2 if turns else 1):
@@ -106,8 +110,8 @@ def _insert(states, chi2s, count, state, chi2):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _mirror(place, anchors, dims):
-    """Mirror a place in the plane (on a level: the line) that anchors are nearest to."""
+def mirror(place, anchors, dims):
+    """Mirror a place in the plane (on a level: the line) that anchors are nearest to; whether they are near at all."""
     centre, axes, width = np.empty(3), np.empty((3, 3)), np.empty(3)
     principal(anchors, dims, centre, axes, width)
     off = 0.0
@@ -115,6 +119,7 @@ def _mirror(place, anchors, dims):
         off += (place[k] - centre[k]) * axes[dims - 1, k]
     for k in range(dims):
         place[k] -= 2 * off * axes[dims - 1, k]
+    return width[dims - 1] < NEARLY_FLAT * width[0]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -156,39 +161,105 @@ def without(rows, c, clock, covariance, index, choices, begin_at, states, chi2s,
     deviations : float64 (q,), out
         The largest of any unknown, the others taken as known.
     """
-    ends, dt, measured = rows
-    emitter_vehicle, emitter_point, receiver_vehicle, receiver_point = ends
-    n, count = len(dt), choices.shape[1]
-    m = len(measured) // n * count
-    part, whiten, kept_measured, from_row = np.empty((m, m)), np.empty((m, m)), np.empty(m), np.empty(m, np.int64)
+    count, m = choices.shape[1], len(rows[2]) // len(rows[1]) * choices.shape[1]
+    part, whiten = np.empty((m, m)), np.empty((m, m))
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, len(index)))
-    kept_ends = (
-        np.empty(count, np.int64),
-        np.empty((count, 3)),
-        np.empty(count, np.int64),
-        np.empty((count, 3)),
-    )
-    kept_dt, known = np.empty(count), np.empty((0, 10))
+    kept, known = room(count, m), np.empty((0, 10))
     for q in range(len(choices)):
-        for i in range(m):
-            from_row[i] = choices[q, i % count] + i // count * n
-            kept_measured[i] = measured[from_row[i]]
-        for i in range(m):
-            for k in range(m):
-                part[i, k] = covariance[from_row[i], from_row[k]]
-        for i in range(count):
-            row = choices[q, i]
-            kept_ends[0][i], kept_ends[2][i], kept_dt[i] = emitter_vehicle[row], receiver_vehicle[row], dt[row]
-            for axis in range(3):
-                kept_ends[1][i, axis], kept_ends[3][i, axis] = emitter_point[row, axis], receiver_point[row, axis]
+        keep(rows, covariance, choices[q], kept, part)
         whitener(part, whiten)
         for j in range(10):
             states[q, j] = begin_at[j]
-        kept, at = (kept_ends, kept_dt, kept_measured), states[q]
-        chi2s[q], _ = descend(kept, c, clock, whiten, index, known, STEPS, at, plain, miss, jacobian)
+        chi2s[q], _ = descend(kept, c, clock, whiten, index, known, STEPS, states[q], plain, miss, jacobian)
         deviations[q] = 0.0
         for j in range(len(index)):
             size = 0.0
             for i in range(m):
                 size += jacobian[i, j] ** 2
             deviations[q] = max(deviations[q], 1.0 / max(np.sqrt(size), 1e-9))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def room(count, m):
+    """Return empty rows for `keep` to fill: so many ends, and m measurements of them."""
+    ends = (np.empty(count, np.int64), np.empty((count, 3)), np.empty(count, np.int64), np.empty((count, 3)))
+    return ends, np.empty(count), np.empty(m)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def keep(rows, covariance, choice, kept, part):
+    """Fill ``kept`` and ``part`` (m, m) with some of the rows and their covariance."""
+    ends, dt, measured = rows
+    kept_ends, kept_dt, kept_measured = kept
+    n, count = len(dt), len(choice)
+    for i in range(len(kept_measured)):
+        a = choice[i % count] + i // count * n
+        kept_measured[i] = measured[a]
+        for k in range(len(kept_measured)):
+            part[i, k] = covariance[a, choice[k % count] + k // count * n]
+    for i in range(count):
+        row = choice[i]
+        kept_ends[0][i], kept_ends[2][i], kept_dt[i] = ends[0][row], ends[2][row], dt[row]
+        for axis in range(3):
+            kept_ends[1][i, axis], kept_ends[3][i, axis] = ends[1][row, axis], ends[3][row, axis]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def rivals(rows, c, clock, covariance, index, flat, level_m, kept, best, limit, reach, bend_m2, bounds_m, away):
+    """Fill ``away`` (4,): how far, level and in height, places may be that rows less any one of ``kept`` allow.
+
+    The first two are of other solutions, the last two of the same one where it is so loose that ranges bend within its
+    reach (solution separation); infinite where a solution leaves a direction open.
+
+    Parameters
+    ----------
+    kept : int64 (p,)
+    best : float64 (10,)
+        The solution of them all.
+    limit : float
+        χ² up to which another is allowed.
+    reach : float
+        How many of its deviations a place may be farther.
+    bend_m2 : float
+        Squared reach within which ranges are straight.
+    bounds_m : float64 (2, 3)
+        Solutions outside are none; infinite where no room is known.
+    """
+    count, m = len(kept) - 1, len(rows[2]) // len(rows[1]) * (len(kept) - 1)
+    part, fewer, choice = np.empty((m, m)), room(count, m), np.empty(count, np.int64)
+    states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, m, len(index)))
+    deviation, sd = np.empty((len(index), len(index))), np.empty(3)
+    away[:] = 0.0
+    for left_out in range(len(kept)):
+        for i in range(count):
+            choice[i] = kept[i + (i >= left_out)]
+        keep(rows, covariance, choice, fewer, part)
+        found = search(fewer, c, clock, part, index, flat, level_m, states, chi2s, jacobians)
+        own, nearest = -1, np.inf
+        for s in range(found):
+            square = 0.0
+            for axis in range(3):
+                square += (states[s, axis] - best[axis]) ** 2
+            if square < nearest:
+                own, nearest = s, square
+        for s in range(found):
+            inside = chi2s[s] <= limit
+            for axis in range(3):
+                inside &= bounds_m[0, axis] - 0.1 <= states[s, axis] <= bounds_m[1, axis] + 0.1
+            if inside and spread(jacobians[s], deviation):
+                for axis in range(3):
+                    sd[axis] = 0.0
+                    for j in range(len(index)):
+                        if index[j] == axis:
+                            sd[axis] = np.sqrt(deviation[j, j])
+                wide, high = reach * np.hypot(sd[0], sd[1]), reach * sd[2]
+                k = 0
+                if s == own:
+                    if wide**2 + high**2 < bend_m2:
+                        continue
+                    k = 2
+                far = np.hypot(states[s, 0] - best[0], states[s, 1] - best[1])
+                away[k] = max(away[k], far + wide)
+                away[k + 1] = max(away[k + 1], abs(states[s, 2] - best[2]) + high)
+            elif inside:
+                away[:] = np.inf

@@ -1,0 +1,125 @@
+"""The sound speed learnt from epoch to epoch: what redundant ranges say of it corrects the thermometer.
+
+Each fix tells the speed that its own ranges ask for, with the speed it was given as the prior (`Fix.sound_speed_mps`).
+Handing that on as the next epoch's prior, a little widened for air that changes, is a Kalman filter of one state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonofix.ranging import with_sound_speed
+from sonofix.records import Event, Fix, RangeEpoch
+
+DOUBTED = 6.0
+"""Before ranges have spoken, a thermometer may be wrong by so many times what is claimed: it hangs in the sun."""
+
+LEARNT = 0.5
+"""The ranges must know the speed this much better than the thermometer before it is theirs."""
+
+WANDER_MPS = 0.6
+"""How far the speed strays in `WANDER_S`, one sigma: a kelvin."""
+
+WANDER_S = 600.0
+
+TOLD = 1e-3
+"""Relative deviation at which the speed is worth telling of, and change at which it is again."""
+
+PATIENCE = 5
+"""Epochs in a row whose ranges disagree before what was learnt is forgotten."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Belief:
+    time_s: float
+    speed_mps: float
+    sd_mps: float
+
+
+class SoundSpeed:
+    """Follows the sound speed of one run; ranges whose epochs take theirs as it is pass through untouched."""
+
+    def __init__(self) -> None:
+        self._belief: _Belief | None = None
+        self._told_mps: float | None = None
+        self._refused = 0
+
+    @property
+    def sound_speed_mps(self) -> float | None:
+        """What has been learnt; None where nothing has."""
+        return None if self._belief is None else self._belief.speed_mps
+
+    def take(
+        self, epoch: RangeEpoch, solve: Callable[[RangeEpoch], tuple[Fix, ...]]
+    ) -> tuple[RangeEpoch, tuple[Fix, ...], tuple[Event, ...]]:
+        """Solve an epoch with the best speed known, and learn from it.
+
+        Parameters
+        ----------
+        epoch : RangeEpoch
+            By the speed that the site states or its thermometer gives.
+        solve : callable
+            Gives the fixes of an epoch.
+
+        Returns
+        -------
+        epoch : RangeEpoch
+            By the speed learnt so far.
+        fixes : tuple of Fix
+            Of that.
+        events : tuple of Event
+            "sound-speed" where it has become known to 0.1 %, or has changed by as much.
+        """
+        if not epoch.sound_speed_sd_mps:
+            return epoch, solve(epoch), ()
+        prior = self._prior(epoch, solve)
+        if prior is None:
+            return epoch, solve(epoch), ()
+        asked = with_sound_speed(epoch, *prior)
+        fixes = solve(asked)
+        best = _best(fixes)
+        self._refused = self._refused + 1 if best is None and any(f.status == "inconsistent" for f in fixes) else 0
+        if best is not None:
+            self._belief = _Belief(epoch.sync_s, *best)
+        elif self._refused >= PATIENCE:
+            self._belief, self._refused = None, 0
+        return asked, fixes, self._tell(epoch)
+
+    def _prior(self, epoch: RangeEpoch, solve: Callable[[RangeEpoch], tuple[Fix, ...]]) -> tuple[float, float] | None:
+        """Return speed and deviation to solve an epoch with; None where ranges have not told of it yet."""
+        sd_mps = epoch.sound_speed_sd_mps
+        if self._belief is not None:
+            aged_s = max(epoch.sync_s - self._belief.time_s, 0.0)
+            aged_sd_mps = float(np.hypot(self._belief.sd_mps, WANDER_MPS * np.sqrt(aged_s / WANDER_S)))
+            return self._belief.speed_mps, min(aged_sd_mps, sd_mps)
+        found = _best(solve(with_sound_speed(epoch, epoch.sound_speed_mps, DOUBTED * sd_mps)))
+        # the speed comes from this very epoch, so that its deviation must not count as known beforehand
+        return (found[0], sd_mps) if found is not None and found[1] < LEARNT * sd_mps else None
+
+    def _tell(self, epoch: RangeEpoch) -> tuple[Event, ...]:
+        belief = self._belief
+        if belief is None or belief.sd_mps > TOLD * belief.speed_mps:
+            return ()
+        if self._told_mps is not None and abs(belief.speed_mps - self._told_mps) <= TOLD * belief.speed_mps:
+            return ()
+        self._told_mps = belief.speed_mps
+        off = belief.speed_mps - epoch.sound_speed_mps
+        text = (
+            f"{belief.speed_mps:.2f} ± {belief.sd_mps:.2f} m/s by the ranges themselves, {off:+.2f} m/s from what the "
+            f"site's air gives"
+        )
+        return (Event(epoch.sync_s, "", "sound-speed", text),)
+
+
+def _best(fixes: tuple[Fix, ...]) -> tuple[float, float] | None:
+    """Return speed and deviation of the fix that knows it best, among those that are well."""
+    known = [
+        (f.sound_speed_sd_mps, f.sound_speed_mps)
+        for f in fixes
+        if f.status == "ok" and f.sound_speed_mps is not None and f.sound_speed_sd_mps is not None
+    ]
+    sd_mps, speed_mps = min(known, default=(0.0, 0.0))
+    return (speed_mps, sd_mps) if known else None
