@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.site import Site
+from sonofix.plan.judge import judged
+from sonofix.site import Beacon, Microphone, Site
 
 Floats = NDArray[np.float64]
 
-# Beyond this dilution a millimetre of range error is ten metres of position: no fix in any useful sense.
-NO_FIX_HDOP = 1e4
 MOST_POINTS = 4_000_000
+AT_ONCE = 4096
+"""Places whose distances are held at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,62 +75,55 @@ def coverage(
     ------
     ValueError
         No node is fixed, an argument is out of range, the margin leaves no area, or the grid would be too large.
-
-    Notes
-    -----
-    With unit vectors u from each node in reach to the point, the normal matrix of the ranges is Σ u uᵀ (horizontal
-    parts), and with an unknown clock Σ (u − ū)(u − ū)ᵀ, ū their mean: the Schur complement of the clock. HDOP is the
-    root of the trace of its inverse (Kaplan and Hegarty, Understanding GPS, section 7.3).
     """
     for name, value, good in (
         ("level_m", level_m, True),
-        ("spacing_m", spacing_m, spacing_m > 0),
-        ("margin_m", margin_m, True),
         ("reach_m", 1.0 if reach_m is None else reach_m, reach_m is None or reach_m > 0),
     ):
         if not (np.isfinite(value) and good):
             raise ValueError(f"{name} = {value:g}; it must be {'a finite number' if good else 'above 0'}")
-    nodes = _fixed_nodes(site)
-    x, y = _grid(site, nodes, spacing_m, margin_m)
-    count = np.zeros((y.size, x.size), dtype=np.int64)
-    sum_x, sum_y, sum_xx, sum_xy, sum_yy = (np.zeros(count.shape) for _ in range(5))
-    for node in nodes:
-        east, north = x[None, :] - node[0], y[:, None] - node[1]
-        distance = np.sqrt(east**2 + north**2 + (level_m - node[2]) ** 2)
-        heard = np.full(count.shape, True) if reach_m is None else distance <= reach_m
-        # A node at the very point tells no direction, so it adds a count and nothing else.
-        scale = np.where(heard & (distance > 0), 1.0 / np.where(distance > 0, distance, 1.0), 0.0)
-        ux, uy = east * scale, north * scale
-        count += heard
-        sum_x += ux
-        sum_y += uy
-        sum_xx += ux * ux
-        sum_xy += ux * uy
-        sum_yy += uy * uy
-    if site.schedule is not None and not site.schedule.synchronised:
-        share = 1.0 / np.maximum(count, 1)
-        sum_xx, sum_xy, sum_yy = sum_xx - share * sum_x**2, sum_xy - share * sum_x * sum_y, sum_yy - share * sum_y**2
-    trace, determinant = sum_xx + sum_yy, sum_xx * sum_yy - sum_xy**2
-    # HDOP² = trace / determinant; compared without dividing, so that singular points need no special care.
-    fix = (trace > 0) & (determinant * NO_FIX_HDOP**2 > trace)
-    hdop = np.full(count.shape, np.nan)
-    hdop[fix] = np.sqrt(trace[fix] / determinant[fix])
-    return Coverage(x, y, float(level_m), count, hdop, float(np.mean(fix)))
+    nodes = np.array([node.position_m for node in coded_or_all(site)], dtype=np.float64)
+    x, y = grid(site, spacing_m, margin_m)
+    places = np.column_stack([np.tile(x, len(y)), np.repeat(y, len(x)), np.full(len(x) * len(y), level_m)])
+    clock = site.schedule is not None and not site.schedule.synchronised
+    count, hdop = np.zeros(len(places), np.int64), np.zeros(len(places))
+    for start in range(0, len(places), AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        apart = np.linalg.norm(places[part, None, :] - nodes[None, :, :], axis=2)
+        got = judged(places[part], nodes, apart <= (np.inf if reach_m is None else reach_m), clock=clock)
+        count[part], hdop[part] = got.heard, got.hdop
+    shape = (len(y), len(x))
+    return Coverage(x, y, float(level_m), count.reshape(shape), hdop.reshape(shape), float(np.mean(np.isfinite(hdop))))
 
 
-def _fixed_nodes(site: Site) -> Floats:
-    """Return the positions (n, 3) of the nodes that stand still: beacons before microphones, coded before others."""
+def coded_or_all(site: Site) -> Sequence[Beacon] | Sequence[Microphone]:
+    """Return the nodes that stand still: beacons before microphones, coded before others.
+
+    Raises
+    ------
+    ValueError
+        Nothing is fixed.
+    """
     beacons = [b for b in site.coded_beacons if b.position_m is not None]
     beacons = beacons or [b for b in site.beacons if b.position_m is not None]
     nodes = beacons or [m for m in site.microphones if m.position_m is not None]
     if not nodes:
         raise ValueError("the site has no fixed node; give a beacon or a microphone a position_m")
-    return np.array([node.position_m for node in nodes], dtype=np.float64)
+    return nodes
 
 
-def _grid(site: Site, nodes: Floats, spacing_m: float, margin_m: float) -> tuple[Floats, Floats]:
-    """Return the x and the y of the map, centred in the area."""
-    corners = np.array(site.bounds_m, dtype=np.float64) if site.bounds_m is not None else nodes
+def grid(site: Site, spacing_m: float, margin_m: float) -> tuple[Floats, Floats]:
+    """Return the x and the y of a map of the site, centred in ``bounds_m``, or else in the box of its fixed nodes.
+
+    Raises
+    ------
+    ValueError
+        An argument is out of range, the margin leaves no area, or there would be too many points.
+    """
+    for name, value, good in (("spacing_m", spacing_m, spacing_m > 0), ("margin_m", margin_m, True)):
+        if not (np.isfinite(value) and good):
+            raise ValueError(f"{name} = {value:g}; it must be {'a finite number' if good else 'above 0'}")
+    corners = np.array(site.bounds_m or [node.position_m for node in coded_or_all(site)], dtype=np.float64)
     low, high = corners.min(axis=0)[:2], corners.max(axis=0)[:2]
     size = high - low - 2.0 * margin_m
     if np.any(size < 0):
