@@ -15,9 +15,11 @@ from sonofix.cli.codes import codes
 from sonofix.cli.console import Stopped
 from sonofix.cli.demo import demo
 from sonofix.cli.explain import explain
+from sonofix.cli.plan import plan
 from sonofix.cli.run import run
 from sonofix.cli.score import score
 from sonofix.cli.simulate import simulate
+from sonofix.cli.survey import survey
 
 MISUSE = 2
 INTERRUPTED = 130
@@ -99,7 +101,7 @@ def sonofix(
     """Positioning by sound: from microphone samples to a fused track."""
 
 
-for command in (run, check, simulate, score, explain, codes, calibrate, demo):
+for command in (run, check, simulate, score, explain, codes, plan, calibrate, survey, demo):
     app.command()(command)
 
 

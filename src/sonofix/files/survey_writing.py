@@ -1,0 +1,204 @@
+"""What a survey writes: the site file with beacons where they are, and all it knows as JSON; whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sonofix.files.problem import Problem, RecordingError
+from sonofix.files.site_file import parse_site, site_text
+from sonofix.files.writing import told
+from sonofix.records import Survey
+from sonofix.site import Beacon, Microphone, Site
+
+_HEADER = re.compile(r"^\s*(\[\[?)\s*([A-Za-z0-9_.\-\"' ]+?)\s*\]\]?\s*(#.*)?$")
+_KEYS = ("position_m", "position_sd_m", "delay_s")
+
+
+def check_new(path: Path, source: Path, replacing: bool) -> None:
+    """Refuse to write over the recording's own site file, or over any file unless told to.
+
+    Raises
+    ------
+    RecordingError
+    """
+    if path.exists() and source.exists() and path.samefile(source):
+        raise RecordingError([Problem(str(path), "", None, "is the survey's own site file; write beside it with -o")])
+    if path.is_dir():
+        raise RecordingError([Problem(str(path), "", None, "is a folder; name a file with -o")])
+    if path.exists() and not replacing:
+        raise RecordingError([Problem(str(path), "", None, "is there already; give --force, or another name with -o")])
+
+
+def corrected_text(text: str, before: Site, after: Site) -> str:
+    """Return a site file's text with its fixed beacons' places, deviations and delays as ``after`` has them.
+
+    Comments, order and everything else stay. Where the text is written in a way that cannot be edited line by line, the
+    whole is written anew, without comments.
+
+    Parameters
+    ----------
+    text : str
+        Of the site file.
+    before, after : Site
+        They may differ in these values alone.
+    """
+    lines = text.splitlines(keepends=True)
+    seen = {"beacon": 0, "microphone": 0}
+    out: list[str] = []
+    pending: dict[str, str] = {}
+    at = 0
+    while at < len(lines):
+        line = lines[at]
+        header = _HEADER.match(line)
+        if header:
+            _add(out, pending)
+            pending = {}
+            if header[1] == "[[" and header[2] in seen:
+                number = seen[header[2]]
+                seen[header[2]] += 1
+                old, new = (getattr(site, f"{header[2]}s") for site in (before, after))
+                if number < len(new):
+                    pending = _changes(old[number], new[number])
+        key = re.match(r"^\s*([A-Za-z0-9_]+)\s*=", line)
+        if key and key[1] in pending:
+            end = _value_end(lines, at)
+            last = lines[end - 1].rstrip("\r\n")
+            remark = _remark(last)
+            indent = line[: len(line) - len(line.lstrip())]
+            out.append(f"{indent}{key[1]} = {pending.pop(key[1])}{'  ' + remark if remark else ''}\n")
+            at = end
+            continue
+        out.append(line)
+        at += 1
+    _add(out, pending)
+    edited = "".join(out)
+    try:
+        if parse_site(edited) == after:
+            return edited
+    except RecordingError:
+        pass
+    return site_text(after)
+
+
+def _changes(old: Beacon | Microphone, new: Beacon | Microphone) -> dict[str, str]:
+    """Keys of one beacon or microphone that differ, as TOML."""
+    out = {}
+    for key in _KEYS:
+        value = getattr(new, key, None)
+        if value is not None and value != getattr(old, key):
+            out[key] = json.dumps(list(value) if isinstance(value, tuple) else value)
+    return out
+
+
+def _add(out: list[str], pending: Mapping[str, str]) -> None:
+    """Write keys that a table did not have yet behind its last one."""
+    if not pending:
+        return
+    at = len(out)
+    while at and (not out[at - 1].strip() or out[at - 1].lstrip().startswith("#")):
+        at -= 1
+    if at and not out[at - 1].endswith("\n"):
+        out[at - 1] += "\n"
+    out[at:at] = [f"{key} = {value}\n" for key, value in pending.items()]
+
+
+def _value_end(lines: list[str], start: int) -> int:
+    """Index of the line after a value: lists may run over several."""
+    for end in range(start + 1, min(start + 12, len(lines)) + 1):
+        try:
+            tomllib.loads("".join(lines[start:end]))
+        except tomllib.TOMLDecodeError:
+            continue
+        return end
+    return start + 1
+
+
+def _remark(line: str) -> str:
+    """Return the comment at a line's end; numbers hold no #."""
+    _, mark, rest = line.partition("#")
+    return mark + rest
+
+
+def write_site(path: str | Path, text: str) -> None:
+    """Write a site file; it is there whole or not at all.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    """
+    _write(Path(path), text)
+
+
+def write_survey(path: str | Path, found: Survey) -> None:
+    """Write all that a survey found, with its covariance, as JSON; unknown values are null.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    """
+    _write(Path(path), json.dumps(survey_values(found), indent=1, allow_nan=False) + "\n")
+
+
+def survey_values(found: Survey) -> dict[str, Any]:
+    """Return a survey as plain values."""
+    return {
+        "status": found.status,
+        "remedy": found.remedy,
+        "gauge": found.gauge,
+        "mirror": found.mirror,
+        "frame_sd": dict(found.frame_sd),
+        "beacons": [
+            {
+                "id": b.id,
+                "before_m": b.before_m.tolist(),
+                "before_sd_m": b.before_sd_m,
+                "position_m": b.position_m.tolist(),
+                "sd_m": b.sd_m.tolist(),
+                "bias_m": b.bias_m,
+                "bias_sd_m": b.bias_sd_m,
+                "heard": b.heard,
+                "used": b.used,
+                "residual_m": _number(b.residual_m),
+                "mirrored": b.mirrored,
+            }
+            for b in found.beacons
+        ],
+        "covariance_m2": found.covariance_m2.tolist(),
+        "unknown": [
+            {"text": d.text, "drive_sd_m": _number(d.drive_sd_m), "sd_m": d.sd_m, "move_m": d.move_m.tolist()}
+            for d in found.open
+        ],
+        "pairs": [{"from": p.emitter, "to": p.receiver, "bias_m": p.bias_m, "sd_m": p.sd_m} for p in found.pairs],
+        "sound_speed_mps": found.sound_speed_mps,
+        "sound_speed_sd_mps": found.sound_speed_sd_mps,
+        "clock_offset_m": found.clock_offset_m,
+        "clock_drift_mps": found.clock_drift_mps,
+        "ranges": found.rows,
+        "excluded": found.excluded,
+        "residual_before_m": _number(found.before_m),
+        "residual_after_m": _number(found.after_m),
+        "rate_residual_after_mps": _number(found.rate_after_mps),
+    }
+
+
+def _number(value: float) -> float | None:
+    """Return a number, None where JSON has none for it."""
+    return value if abs(value) < float("inf") else None
+
+
+def _write(path: Path, text: str) -> None:
+    with told(path.parent, path.name):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f"{path.name}.part")
+        try:
+            part.write_text(text, encoding="utf-8")
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)

@@ -1,0 +1,51 @@
+"""Surveys of many made drives: deviations are true, whatever is known before."""
+
+import numpy as np
+import pytest
+from made_drive import HALL, circle, hall, heard, wander
+from scipy.stats import chi2
+
+from sonofix.survey.gauge import freedom, laid_upon
+from sonofix.survey.places import Wishes, survey
+
+DRIVES = 50
+PLACES = HALL[[0, 2, 4, 5, 6]]
+
+
+def nees(way, seed: int, known: int, biases: str, count: int) -> tuple[float, int]:
+    """Squared error over covariance of one survey, open rigid motions taken out, and its degrees of freedom."""
+    rng = np.random.default_rng(seed)
+    sd = np.full(len(PLACES), 0.2)
+    sd[:known] = 0.0
+    site = hall(PLACES + sd[:, None] * rng.standard_normal(PLACES.shape), sd)
+    bias = 0.05 * rng.standard_normal(len(PLACES)) if biases == "beacon" else 0.0
+    epochs = heard(site, PLACES, way, count, rng, bias_m=bias, period_s=0.9)
+    found = survey(site, epochs, Wishes(biases=biases, bias_sd_m=0.05))
+    places = np.array([b.position_m for b in found.beacons])
+    target = PLACES if known else laid_upon(PLACES, places, True)
+    error = (places - target)[known:].ravel()
+    covariance = found.covariance_m2[3 * known :, 3 * known :]
+    free = freedom(places[known:], places[:known], True).basis
+    inside = np.linalg.svd(np.hstack([free, np.zeros((len(error), len(error)))]))[0][:, free.shape[1] :]
+    error, covariance = inside.T @ error, inside.T @ covariance @ inside
+    return float(error @ np.linalg.solve(covariance, error)), len(error)
+
+
+LONG = pytest.mark.prove
+
+
+@pytest.mark.parametrize(
+    ("known", "biases"), [(0, "none"), pytest.param(2, "beacon", marks=LONG), pytest.param(0, "beacon", marks=LONG)]
+)
+def test_errors_are_as_large_as_stated(known: int, biases: str) -> None:
+    totals = [nees(wander, seed, known, biases, 20) for seed in range(DRIVES)]
+    total, degrees = (sum(part) for part in zip(*totals, strict=True))
+    low, high = chi2.ppf([0.0005, 0.9995], degrees)
+    # deviations are widened where residuals happen to be large, and never narrowed: some percent of variance
+    assert 0.9 * low < total < high
+
+
+def test_errors_are_never_larger_than_stated_on_a_circle() -> None:
+    for seed in range(4):
+        value, degrees = nees(circle, seed, 0, "none", 26)
+        assert value < chi2.ppf(1 - 1e-4, degrees)
