@@ -62,7 +62,7 @@ def peaks(
             if peak is None or peak.power < peak.threshold * peak.noise:
                 continue
             arrival_s, beta = peak.start_s + bank.waveform.duration_s / 2, peak.range_rate_mps / plan.sound_speed_mps
-            covariance = np.diag([PEAK_SD_S**2, (bank.step / plan.sound_speed_mps) ** 2])
+            covariance = np.diag([PEAK_SD_S**2, (bank.step_mps / plan.sound_speed_mps) ** 2])
             found.append(Detection(bank.emitter, receiver, arrival_s, 1.0 - beta, covariance, np.sqrt(peak.power), 0.0))
     return tuple(found), ()
 

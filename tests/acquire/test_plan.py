@@ -199,3 +199,10 @@ def test_plan_knows_how_much_it_needs() -> None:
 def test_nothing_to_listen_for_is_refused() -> None:
     with pytest.raises(ValueError, match="no beacon has a code"):
         make_plan({}, RATE_HZ, SPEED)
+
+
+def test_samples_that_are_not_finite_are_refused() -> None:
+    samples = np.zeros(4800, np.float32)
+    samples[7] = np.nan
+    with pytest.raises(ValueError, match=r"1 of 4800 samples are not finite"):
+        acquire(PLAN, samples, 0, "M", {"A": (0.0, 0.01)})

@@ -54,7 +54,7 @@ class Bank:
     kept: dict[int, NDArray[np.complex64]] = field(default_factory=dict, repr=False)
 
     @property
-    def step(self) -> float:
+    def step_mps(self) -> float:
         """Between two range rates, m/s; 0 where there is but one."""
         return float(self.range_rate_mps[1] - self.range_rate_mps[0]) if len(self.range_rate_mps) > 1 else 0.0
 

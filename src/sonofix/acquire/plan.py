@@ -115,7 +115,15 @@ def acquire(
     detections : tuple of Detection, strongest first
     notes : tuple of str
         What was done to the samples before.
+
+    Raises
+    ------
+    ValueError
+        If samples are not finite; `epochs.screen` makes them so.
     """
+    if not np.isfinite(samples).all():
+        bad = int(np.sum(~np.isfinite(samples)))
+        raise ValueError(f"{bad} of {samples.size} samples are not finite; pass them through epochs.screen first")
     notes: list[str] = []
     found: list[Detection] = []
     for job in taken_apart(plan, samples, first_sample, windows, predictions):

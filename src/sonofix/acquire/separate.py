@@ -341,7 +341,7 @@ class Separation:
             self.band,
             old.start_s - reach_s,
             old.start_s + reach_s,
-            (old.range_rate_mps - bank.step, old.range_rate_mps + bank.step),
+            (old.range_rate_mps - bank.step_mps, old.range_rate_mps + bank.step_mps),
             [],
             self.false_alarm_rate,
         )

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import Stopped, figure_text, length_text, print_table, progress_bar, speaker
+from sonofix.cli.console import Stopped, drawing, figure_text, length_text, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
     from sonofix.records import Calibration, Recording
     from sonofix.site import Beacon, Site
@@ -64,7 +60,7 @@ def calibrate(
                 f"beacon {beacon_id}", total=None if source.sample_count is None else 2 * source.sample_count
             )
             learnt = learn(
-                _watched(source, lambda count: bar.advance(task, count)),
+                watched(source, lambda count: bar.advance(task, count)),
                 beacon_id,
                 microphone_id,
                 distance_m=distance,
@@ -129,18 +125,6 @@ def _check_distance(source: Recording, beacon_id: str, microphone_id: str, dista
         )
 
 
-def _watched(source: Recording, seen: Callable[[int], None]) -> Recording:
-    blocks = source.blocks
-    assert blocks is not None
-
-    def counted(length: int) -> Iterator[NDArray[np.float32]]:
-        for block in blocks(length):
-            yield block
-            seen(len(block))
-
-    return replace(source, blocks=counted)
-
-
 def _tell(before: Beacon, site: Site, learnt: Calibration) -> None:
     """Print what was learnt: a figure and its deviation a row."""
     pace = learnt.pace
@@ -195,11 +179,7 @@ def _micro(time_s: float) -> str:
 
 def _draw(picture: Path, learnt: Calibration, name: str) -> None:
     """Draw the picture; say so where Matplotlib is not installed."""
-    try:
+    with drawing():
         from sonofix.draw.calibration import draw_calibration
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith("matplotlib"):
-            raise
-        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
-        return
-    draw_calibration(learnt, f"Beacon {learnt.beacon}, {name}").savefig(picture)
+
+        draw_calibration(learnt, f"Beacon {learnt.beacon}, {name}").savefig(picture)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import Stopped, counted, print_table, progress_bar, speaker
+from sonofix.cli.console import Stopped, counted, drawing, print_table, progress_bar, speaker
 
 if TYPE_CHECKING:
     from sonofix.cli.codes_task import Task
@@ -272,23 +272,19 @@ def _draw(
     """Draw the picture; say so where Matplotlib is not installed."""
     from sonofix.plan.crosstalk import Bench, level_db
 
-    try:
+    with drawing():
         from sonofix.draw.codes import draw_codes
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith("matplotlib"):
-            raise
-        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
-        return
-    i, j = chosen.worst_pair
-    surface, difference_mps, delay_s = Bench([bursts[i], bursts[j]], grid).surface(0, 1)
-    labels = [f"{beacon}  {code_name(code)}" for beacon, code in zip(task.ids, named, strict=True)]
-    draw_codes(
-        labels,
-        chosen.level_db,
-        level_db(surface),
-        difference_mps,
-        delay_s,
-        task.sound_speed_mps,
-        title=f"{counted(task.count, 'code')}{f' for {task.name}' if task.name else ''}",
-        note=task.describe(),
-    ).savefig(picture)
+
+        i, j = chosen.worst_pair
+        surface, difference_mps, delay_s = Bench([bursts[i], bursts[j]], grid).surface(0, 1)
+        labels = [f"{beacon}  {code_name(code)}" for beacon, code in zip(task.ids, named, strict=True)]
+        draw_codes(
+            labels,
+            chosen.level_db,
+            level_db(surface),
+            difference_mps,
+            delay_s,
+            task.sound_speed_mps,
+            title=f"{counted(task.count, 'code')}{f' for {task.name}' if task.name else ''}",
+            note=task.describe(),
+        ).savefig(picture)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.console import Console
     from rich.progress import Progress
+
+    from sonofix.records import Recording
 
 
 class Stopped(KeyboardInterrupt):
@@ -40,6 +45,31 @@ def progress_bar() -> Iterator[Progress]:
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield bar
+
+
+def watched(recording: Recording, seen: Callable[[int], None]) -> Recording:
+    """Return the recording with its samples counted as they are read; as it is where it has none."""
+    blocks = recording.blocks
+    if blocks is None:
+        return recording
+
+    def counted_blocks(length: int) -> Iterator[NDArray[np.float32]]:
+        for block in blocks(length):
+            yield block
+            seen(len(block))
+
+    return replace(recording, blocks=counted_blocks)
+
+
+@contextmanager
+def drawing() -> Iterator[None]:
+    """Import what draws, and draw, within; where Matplotlib is not installed that is said and the rest goes on."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("matplotlib"):
+            raise
+        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Mapping[str, Sequence[str]]) -> None:

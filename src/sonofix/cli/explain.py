@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import Stopped, counted, length_text, print_table, progress_bar, speaker
+from sonofix.cli.console import Stopped, counted, drawing, length_text, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
     from sonofix.records import BandInsight, BeaconInsight, Insight, Recording
     from sonofix.site import Site
@@ -61,7 +59,7 @@ def explain(
     try:
         with progress_bar() as bar:
             task = bar.add_task(f"to epoch {epoch}", total=_samples_wanted(source, epoch))
-            seen = flow.explain(_watched(source, lambda n: bar.advance(task, n)), epoch, microphone)
+            seen = flow.explain(watched(source, lambda n: bar.advance(task, n)), epoch, microphone)
     except KeyboardInterrupt:
         raise Stopped("stopped; nothing was written") from None
     if beacon:
@@ -105,19 +103,6 @@ def _samples_wanted(source: Recording, epoch: int) -> int | None:
         return source.sample_count
     needed = int((epoch + 1.5) * schedule.period_s * source.rate_hz)
     return needed if source.sample_count is None else min(needed, source.sample_count)
-
-
-def _watched(source: Recording, seen: Callable[[int], None]) -> Recording:
-    blocks = source.blocks
-    if blocks is None:
-        return source
-
-    def counted_blocks(length: int) -> Iterator[NDArray[np.float32]]:
-        for block in blocks(length):
-            yield block
-            seen(len(block))
-
-    return replace(source, blocks=counted_blocks)
 
 
 def _narrowed(seen: Insight, names: list[str]) -> Insight:
@@ -203,12 +188,8 @@ def _cells(beacon: BeaconInsight) -> Iterator[tuple[str, ...]]:
 
 def _draw(out: Path, stem: str, seen: Insight, name: str) -> None:
     """Draw the pictures; say so where Matplotlib is not installed."""
-    try:
+    with drawing():
         from sonofix.draw.explain import draw_insight
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith("matplotlib"):
-            raise
-        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
-        return
-    for page, figure in draw_insight(seen, name).items():
-        figure.savefig(out / f"{stem}-{page}.png")
+
+        for page, figure in draw_insight(seen, name).items():
+            figure.savefig(out / f"{stem}-{page}.png")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from sonofix.cli.console import Stopped, counted, length_text, print_table, progress_bar, speaker
+from sonofix.cli.console import Stopped, counted, drawing, length_text, print_table, progress_bar, speaker
 
 if TYPE_CHECKING:
     from sonofix.cli.plan_task import Task
@@ -264,24 +264,20 @@ def _draw(
     picture: Path, task: Task, nodes: Nodes, moving: list[int], before: Quality, after: Quality | None, fault_m: float
 ) -> None:
     """Draw the picture; say so where Matplotlib is not installed."""
-    try:
+    with drawing():
         from sonofix.draw.quality import draw_quality
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith("matplotlib"):
-            raise
-        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
-        return
-    old = len(task.nodes)
-    added, moved = nodes.ids[old:], [nodes.ids[i] for i in moving]
-    draw_quality(
-        after or before,
-        dict(zip(nodes.ids, nodes.position_m, strict=True)),
-        task.terms.walls,
-        title=task.site.name,
-        note="  ·  ".join(sentence.rstrip(".") for sentence in task.told[:2]),
-        before=None if after is None else before,
-        fault_m=fault_m,
-        added=added,
-        moved={name: task.nodes.position_m[i] for name, i in zip(moved, moving, strict=True)},
-        room_m=task.site.bounds_m,
-    ).savefig(picture)
+
+        old = len(task.nodes)
+        added, moved = nodes.ids[old:], [nodes.ids[i] for i in moving]
+        draw_quality(
+            after or before,
+            dict(zip(nodes.ids, nodes.position_m, strict=True)),
+            task.terms.walls,
+            title=task.site.name,
+            note="  ·  ".join(sentence.rstrip(".") for sentence in task.told[:2]),
+            before=None if after is None else before,
+            fault_m=fault_m,
+            added=added,
+            moved={name: task.nodes.position_m[i] for name, i in zip(moved, moving, strict=True)},
+            room_m=task.site.bounds_m,
+        ).savefig(picture)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import Stopped, counted, print_table, progress_bar, speaker
+from sonofix.cli.console import Stopped, counted, drawing, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
 
     from sonofix.cli.tally import Tally
     from sonofix.records import Recording, Step
@@ -75,22 +72,13 @@ def run_folder(folder: Path, out: Path, plot: bool, rate_hz: float | None) -> No
 
 def _watched(recording: Recording, bar: Progress) -> tuple[Recording, Callable[[Step], None]]:
     """Return the recording with its samples counted as they are read, and what counts rows where it has none."""
-    blocks = recording.blocks
     name = recording.site.name
-    if blocks is None:
+    if recording.blocks is None:
         rows = 0 if recording.ranges is None else len(recording.ranges.time_s)
         task = bar.add_task(name, total=rows or None)
         return recording, lambda step: bar.advance(task, len(step.ranges))
     task = bar.add_task(name, total=recording.sample_count)
-    return replace(recording, blocks=lambda length: _counted_blocks(blocks(length), bar, task)), lambda step: None
-
-
-def _counted_blocks(
-    blocks: Iterator[NDArray[np.float32]], bar: Progress, task: TaskID
-) -> Iterator[NDArray[np.float32]]:
-    for block in blocks:
-        yield block
-        bar.advance(task, len(block))
+    return watched(recording, lambda count: bar.advance(task, count)), lambda step: None
 
 
 def _seen(steps: Iterator[Step], *watchers: Callable[[Step], None]) -> Iterator[Step]:
@@ -159,11 +147,7 @@ def _summarise(folder: Path, out: Path, tally: Tally, scored: bool) -> None:
 
 def _draw(picture: Path, recording: Recording, steps: list[Step], truths: dict) -> None:
     """Draw the picture; say so where Matplotlib is not installed."""
-    try:
+    with drawing():
         from sonofix.draw.track import draw_track
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith("matplotlib"):
-            raise
-        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
-        return
-    draw_track(recording, steps, truths).savefig(picture)
+
+        draw_track(recording, steps, truths).savefig(picture)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import Stopped, counted, length_text, print_table, progress_bar, speaker
+from sonofix.cli.console import Stopped, counted, drawing, length_text, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
     from sonofix.records import RangeEpoch, Recording, Survey, SurveyedBeacon
     from sonofix.site import Site
@@ -123,21 +121,8 @@ def _heard(source: Recording, seen: Callable[[int], None]) -> list[RangeEpoch]:
 
     if source.blocks is None and source.ranges is not None:
         return stated_epochs(source.ranges, source.site)
-    listened = replace(_watched(source, seen), site=unplaced(source.site), tables={})
+    listened = replace(watched(source, seen), site=unplaced(source.site), tables={})
     return [step.ranges for step in run(listened) if len(step.ranges)]
-
-
-def _watched(source: Recording, seen: Callable[[int], None]) -> Recording:
-    blocks = source.blocks
-    if blocks is None:
-        return source
-
-    def counted_blocks(length: int) -> Iterator[NDArray[np.float32]]:
-        for block in blocks(length):
-            yield block
-            seen(len(block))
-
-    return replace(source, blocks=counted_blocks)
 
 
 def _tell(site: Site, found: Survey, stated: bool) -> None:
@@ -228,12 +213,9 @@ def _speed_text(found: Survey) -> str:
 
 def _draw(picture: Path, site: Site, found: Survey) -> bool:
     """Draw the picture; say so where Matplotlib is not installed."""
-    try:
+    with drawing():
         from sonofix.draw.survey import draw_survey
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith("matplotlib"):
-            raise
-        speaker().print("No picture: drawing needs Matplotlib; pip install 'sonofix[plot]', or run with --no-plot")
-        return False
-    draw_survey(found, site.name, site.bounds_m).savefig(picture)
-    return True
+
+        draw_survey(found, site.name, site.bounds_m).savefig(picture)
+        return True
+    return False
