@@ -193,11 +193,18 @@ def test_a_recording_tells_its_rate_and_is_not_written_into(store) -> None:
     [
         (("--goal", "best"), "--goal best: it must be error or faults"),
         (("--improve", 0), "--improve 0: nothing to place"),
-        (("--move",), "--improve 0: nothing to place"),
+        (("--move",), "--move: nothing to place"),
+        (("--goal", "faults"), "--goal faults: nothing is placed without --improve or --move"),
+        (("--places", "p.csv"), "--places p.csv: nothing is placed without --improve or --move"),
+        (("--aim", "centre"), "--aim centre: only beams point anywhere; give --beam as well"),
+        (("--range-sd", 0.1, "--beam", 60), "--range-sd with --beam: "),
+        (("--range-sd", 0.1, "--noise-db", -40, "--rate", 96000), "--range-sd with --noise-db, --rate: "),
+        (("--range-sd", 0.1, "--level", 1), "--range-sd with --level: "),
+        (("--walls", "."), ".: cannot be read: it is a folder"),
         (("--fault", 0), "--fault 0: it must be above 0"),
         (("--spacing", 0), "spacing_m = 0; it must be above 0"),
         (("--margin", 7), "margin_m = 7 leaves nothing of 20 m by 12 m"),
-        (("--level", -1), "--level -1: it must be above 0"),
+        (("--level", -1), "--level -1: it must be above 0, in parts of full scale"),
         (("--beam", 2), "--beam 2: the full width"),
         (("--aim", "up"), "--aim up: it must be down or centre"),
         (("--snr", "loud"), "--snr loud: write it as DB@M"),
@@ -249,3 +256,46 @@ def test_a_stop_keeps_the_map_of_what_is_there(store, monkeypatch) -> None:
     assert "stopped; store/plan holds the map of the beacons as they are" in told.stderr.replace("\\", "/")
     assert len(rows(store / "plan")) == 21 * 13
     assert not (store / "plan" / "improved.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("18,3,-0.5", "(18, 3, -0.5) m is below the floor, at 0 m"),
+        ("18,3,5.5", "(18, 3, 5.5) m is outside the room, (0, 0, 0) to (20, 12, 5) m"),
+        ("-2,3,4", "(-2, 3, 4) m is outside the room"),
+    ],
+)
+def test_places_where_nothing_can_be_fastened_are_refused(store, place, message) -> None:
+    places = store / "places.csv"
+    places.write_text(f"x_m,y_m,z_m\n3,11.9,4.5\n{place}\n20,6,5\n", "utf-8")
+    assert message in refused(store, "--improve", 1, "--places", places, *FAST)
+    assert not (store / "plan").exists()
+
+
+def test_what_is_read_is_not_written_over(store) -> None:
+    places = store / "plan" / "plan.csv"
+    places.parent.mkdir()
+    places.write_text("x_m,y_m,z_m\n3,11.9,4.5\n", "utf-8")
+    assert "would be replaced by what is written" in refused(store, "--improve", 1, "--places", places, *FAST)
+    assert places.read_text("utf-8").endswith("3,11.9,4.5\n")
+
+
+def test_a_level_ceiling_promises_no_height_without_a_room_that_ends_below_its_mirror(store) -> None:
+    site = store / "site.toml"
+    text = site.read_text("utf-8").replace("z_m = 0.0\n", "").replace("4.8]", "4.5]")
+    fixed = {}
+    for name, bounds in (("open", ""), ("tall", "12.0]]"), ("room", "5.0]]")):
+        changed = re.sub(r"bounds_m = .*\n", "", text) if not bounds else text.replace("5.0]]", bounds)
+        site.write_text(changed, "utf-8")
+        fixed[name] = ask(site, *FAST)
+    assert figure(fixed["open"], "floor with a fix") == figure(fixed["tall"], "floor with a fix") == ["0.0 %"]
+    assert figure(fixed["room"], "floor with a fix") == ["100.0 %"]
+    assert "The map is of the box of the beacons, (0.5, 0.5) to (19.5, 11.5) m" in fixed["open"]
+    assert "The map is of" not in fixed["room"]
+
+
+def test_a_single_obstacle_is_counted_as_one(store) -> None:
+    outline = [[4, 2], [6, 2], [6, 4], [4, 4], [4, 2]]
+    (store / "one.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [outline]}), "utf-8")
+    assert "; 1 obstacle and 0 pieces of wall." in ask(store, "--walls", store / "one.geojson", *FAST)

@@ -179,7 +179,7 @@ def test_full_disk_is_one_line(tmp_path):
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
 def test_ctrl_c_keeps_what_is_done(tmp_path):
-    folder = ranged(tmp_path / "rec", 5_000)
+    folder = ranged(tmp_path / "rec", 40_000)
     command = [sys.executable, "-c", "from sonofix.cli.main import main; main()", "run", str(folder), "--no-plot"]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     fixes = folder / "out" / "fixes.csv"

@@ -10,11 +10,13 @@ from typer.testing import CliRunner
 
 from sonofix.channel import Sampled, direct_gains, noise_for_snr, simulate
 from sonofix.cli.main import app
-from sonofix.files import read_site, write_recording
+from sonofix.files import RecordingError, read_site, write_recording
+from sonofix.files.site_file import site_text
+from sonofix.files.survey_writing import check_targets
 from sonofix.records import RangeRows, Recording
 from sonofix.signals.codes import primitive_taps
 from sonofix.signals.waveform import waveforms_of
-from sonofix.site import Site
+from sonofix.site import ReferenceCode, Site
 
 runner = CliRunner()
 PLACES = {"B1": (0.0, 0.0, 2.8), "B2": (8.0, 0.0, 3.1), "B3": (8.0, 6.0, 2.6), "B4": (0.0, 6.0, 2.9), "B5": (4, 6.2, 3)}
@@ -146,15 +148,94 @@ def test_all_known_moves_nothing_and_says_so(tmp_path) -> None:
     [
         (["--known", "B9"], "--known B9: the site has no such fixed beacon; it has B1, B2"),
         (["--biases", "some"], "--biases some: one of beacon, pair, none"),
-        (["-o", "{folder}/site.toml"], "is the survey's own site file"),
-        (["-o", "{folder}/ranges.csv"], "--force"),
+        (["-o", "{folder}/site.toml"], "is the survey's own site.toml"),
+        (["-o", "{folder}/site.toml", "--force"], "is the survey's own site.toml"),
+        (["-o", "{folder}/j.toml", "--json", "{folder}/site.toml"], "is the survey's own site.toml; write the JSON"),
+        (["--json", "{folder}/../rec/site.toml", "--force"], "is the survey's own site.toml"),
+        (["-o", "{folder}/ranges.csv", "--force"], "is the survey's own ranges.csv"),
+        (["--json", "{folder}/capture.flac", "--force"], "is the survey's own capture.flac"),
+        (["-o", "{folder}/x", "--json", "{folder}/../rec/x"], "where the site file goes, and the JSON too"),
+        (["-o", "{folder}/x.png"], "where the site file goes, and the picture too"),
+        (["--json", "{folder}/site_corrected.png"], "where the JSON goes, and the picture too"),
+        (["-o", "{folder}/ranges.csv/x.toml"], "cannot be written"),
         (["-o", "{folder}"], "is a folder"),
+        (["-o", "."], "is a folder"),
     ],
 )
 def test_mistakes_are_told_in_a_line(tmp_path, options, words) -> None:
     folder = ranged(tmp_path / "rec", epochs=12)
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
     told = runner.invoke(app, ["survey", str(folder), *(o.format(folder=folder) for o in options)])
     assert told.exit_code == 2
     assert words in told.stderr
     assert len(told.stderr.splitlines()) == 1
+    assert before == {p.name: p.read_bytes() for p in folder.iterdir()}
     assert sorted(p.name for p in folder.iterdir()) == ["ranges.csv", "site.toml"]
+
+
+@pytest.mark.parametrize("option", ["-o", "--json"])
+def test_a_reference_of_the_recording_is_never_written_over(tmp_path, option) -> None:
+    site = Site.model_validate(hall())
+    site = site.model_copy(
+        update={"beacons": tuple(b.model_copy(update={"code": ReferenceCode(reference="b.wav")}) for b in site.beacons)}
+    )
+    (tmp_path / "b.wav").write_bytes(b"sound")
+    (tmp_path / "link.toml").symlink_to(tmp_path / "b.wav")
+    other = {"-o": "site file", "--json": "JSON"}[option]
+    with pytest.raises(RecordingError, match=r"is the survey's own b\.wav"):
+        check_targets({other: tmp_path / "link.toml"}, tmp_path, site, True)
+    check_targets({other: tmp_path / "new.toml"}, tmp_path, site, False)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["b.wav", "link.toml"]
+
+
+def test_an_unrelated_picture_is_kept_unless_forced(tmp_path) -> None:
+    folder = ranged(tmp_path / "rec")
+    (folder / "site_corrected.png").write_bytes(b"a photograph")
+    asked = ["survey", str(folder), "--biases", "none"]
+    told = runner.invoke(app, asked)
+    assert told.exit_code == 2
+    assert "site_corrected.png: is there already; give --force, or another name for the picture" in told.stderr
+    assert (folder / "site_corrected.png").read_bytes() == b"a photograph"
+    assert not (folder / "site_corrected.toml").exists()
+    assert runner.invoke(app, [*asked, "--force"]).exit_code == 0
+    assert (folder / "site_corrected.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("drive", "epochs", "words"),
+    [
+        (lambda t: way(0 * t + 1.0), 20, "the vehicle stood still: over 20 epochs no range changes by more than"),
+        (
+            way,
+            1,
+            "one epoch alone is heard, which brings 5 different ranges for 22 unknowns (5 guessed places, 5 delays",
+        ),
+        (way, 4, "too little is heard: 20 ranges and range rates for 22 unknowns"),
+    ],
+)
+def test_what_cannot_be_surveyed_is_told_with_its_true_reason(tmp_path, drive, epochs, words) -> None:
+    folder = ranged(tmp_path / "rec", drive, epochs)
+    told = runner.invoke(app, ["survey", str(folder)])
+    assert told.exit_code == 2
+    assert f"{folder}: no survey: {words}" in told.stderr
+    assert sorted(p.name for p in folder.iterdir()) == ["ranges.csv", "site.toml"]
+
+
+@pytest.mark.parametrize("guess_sd", ["0.01", "0.1"])
+@pytest.mark.parametrize("biases", ["none", "beacon"])
+def test_a_straight_drive_of_unknown_level_is_surveyed_as_far_as_it_goes(tmp_path, guess_sd, biases) -> None:
+    folder = ranged(tmp_path / "rec", line)
+    site = folder / "site.toml"
+    rough = Site.model_validate(hall(float(guess_sd)))
+    text = site_text(rough.model_copy(update={"vehicles": (rough.vehicles[0].model_copy(update={"z_m": None}),)}))
+    site.write_text(text, "utf-8")
+    told = runner.invoke(
+        app, ["survey", str(folder), "--no-plot", "--biases", biases, "--json", str(tmp_path / "s.json")]
+    )
+    assert told.exit_code == 0, told.stderr
+    assert "This drive does not tell" in told.stdout
+    values = json.loads((tmp_path / "s.json").read_text())
+    assert values["unknown"]
+    for beacon in values["beacons"]:
+        off = np.array(beacon["position_m"]) - PLACES[beacon["id"]]
+        assert np.all(np.abs(off) < 5 * float(guess_sd))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
+from sonofix.draw import style
 from sonofix.draw.quality import draw_quality
 from sonofix.records import Quality, Walls
 
@@ -130,3 +131,11 @@ def test_one_place_and_one_beacon_are_drawn() -> None:
     figure = draw_quality(quality, {"B1": np.zeros(3)}, Walls.none(), title="a point")
     figure.canvas.draw()
     assert figure.axes[0].images[-1].get_array().shape == (1, 1)
+
+
+@pytest.mark.parametrize("fix", [False, True])
+def test_what_is_no_success_is_not_green(fix) -> None:
+    figure = draw_quality(made(False, fix=fix), BEACONS, WALLS, title="store", fault_m=0.5)
+    colours = {text.get_color() for text in figure.texts if text.get_text() in ("0 %", "no fix")}
+    assert colours == {style.EXCLUDED}
+    assert any(text.get_color() == style.GOOD for text in figure.texts) is fix

@@ -83,6 +83,12 @@ def test_a_bare_geometry_and_a_collection_are_taken(tmp_path) -> None:
         (plan(feature("LineString", SQUARE, height_m="high")), r"feature 1 height_m = \"high\": must be a number"),
         (plan(feature("LineString", SQUARE, height_m=0)), r"feature 1 height_m = 0: must be a number above 0"),
         (plan(feature("LineString", SQUARE, height_m=True)), r"feature 1 height_m = true: must be a number"),
+        (plan(feature("LineString", SQUARE, height_m=10**400)), r"feature 1 height_m = inf: must be a number above 0"),
+        (plan(feature("LineString", [[0, 0], [10**400, 1]])), r"= \[inf, 1\]: a point is \[x, y\], numbers in m"),
+        (plan(feature("LineString", [[0, 0], [1, -(10**20)]])), r"numbers in m, within 1e\+06"),
+        ('{"type": "LineString", "coordinates": [[0, 0], [1, ' + 5000 * "9" + "]]}", r"= \[1, inf\]: a point"),
+        ('{"type": "LineString", "coordinates": [[0, 0], [1, 1e999]]}', r"= \[1, inf\]: a point"),
+        ('{"type": ' + 5000 * "9" + "}", r"geometry.type|feature 1"),
     ],
 )
 def test_mistakes_name_feature_field_value_and_remedy(tmp_path, held, message) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from sonofix.files import RecordingError
 from sonofix.files.site_file import parse_site
-from sonofix.files.survey_writing import check_new, corrected_text, survey_values, write_site, write_survey
+from sonofix.files.survey_writing import check_targets, corrected_text, survey_values, write_site, write_survey
 from sonofix.records import OpenDirection, PairBias, Survey, SurveyedBeacon
 
 TEXT = """# our hall
@@ -78,17 +78,18 @@ def test_a_file_without_a_last_line_break_is_added_to() -> None:
 
 
 def test_writing_over_needs_a_word_and_the_source_stays(tmp_path) -> None:
-    source, target = tmp_path / "site.toml", tmp_path / "new.toml"
-    source.write_text(TEXT)
-    check_new(target, source, False)
+    target = tmp_path / "new.toml"
+    (tmp_path / "site.toml").write_text(TEXT)
+    site = parse_site(TEXT)
+    check_targets({"site file": target}, tmp_path, site, False)
     target.write_text("x")
     with pytest.raises(RecordingError, match="--force"):
-        check_new(target, source, False)
-    check_new(target, source, True)
-    with pytest.raises(RecordingError, match="own site file"):
-        check_new(tmp_path / "." / "site.toml", source, True)
+        check_targets({"site file": target}, tmp_path, site, False)
+    check_targets({"site file": target}, tmp_path, site, True)
+    with pytest.raises(RecordingError, match=r"survey's own site\.toml"):
+        check_targets({"site file": tmp_path / "." / "site.toml"}, tmp_path, site, True)
     with pytest.raises(RecordingError, match="is a folder"):
-        check_new(tmp_path, source, True)
+        check_targets({"site file": tmp_path}, tmp_path, site, True)
     write_site(target, "format = 1\n")
     assert target.read_text() == "format = 1\n"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["new.toml", "site.toml"]

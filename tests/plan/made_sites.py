@@ -51,7 +51,7 @@ def ready(site: Site, budget: Budget | None = BUDGET, walls: Walls | None = None
         "sound_speed_mps": site.sound_speed_mps,
         "budget": budget,
         "free_level": site.vehicles[0].z_m is None,
-        "bounds_m": np.array(site.bounds_m)[:, :2],
+        "bounds_m": np.array(site.bounds_m),
         "walls": walls or Walls.none(),
     }
     return nodes, Terms(**{**given, **terms})

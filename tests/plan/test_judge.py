@@ -8,6 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sonofix.locate.integrity import minimum_detectable_bias
+from sonofix.locate.many import STATUSES, fix_many
 from sonofix.plan.judge import WEAK, judged
 from sonofix.plan.quality import detected_shifts
 
@@ -92,15 +93,66 @@ def test_without_a_range_to_spare_no_fault_is_detected() -> None:
 
 def test_two_beacons_fix_only_where_the_room_rules_out_the_mirror() -> None:
     wall, middle = np.array([[1.0, 0, 3], [9, 0, 3]]), np.array([[1.0, 4, 3], [9, 4, 3]])
-    box, place, weight = np.array([[0.0, 0], [10, 8]]), np.array([[4.0, 3.0, 0.5]]), np.full((1, 2), 1e6)
-    assert np.isfinite(judged(place, wall, weight, bounds_m=box).sd_m[0])
-    assert np.isnan(judged(place, middle, weight, bounds_m=box).sd_m[0])
-    assert np.isfinite(judged(place, middle, weight).sd_m[0])  # nothing is known of a room
-    # at y = 0.5 the mirror image of the middle line is at 7.5, inside; at 8.5 it would not be
-    outside = np.array([[4.0, -0.5, 0.5]])
-    assert np.isfinite(judged(outside, middle, weight, bounds_m=box).sd_m[0])
+    box, place, weight = np.array([[0.0, 0, 0], [10, 8, 4]]), np.array([[4.0, 3.0, 0.5]]), np.full((1, 2), 1e6)
+    assert np.isfinite(judged(place, wall, weight, mirrors=True, bounds_m=box).sd_m[0])
+    assert np.isnan(judged(place, middle, weight, mirrors=True, bounds_m=box).sd_m[0])
+    assert np.isnan(judged(place, wall, weight, mirrors=True).sd_m[0])  # nothing is known of a room
+    assert np.isfinite(judged(place, wall, weight).sd_m[0])  # nor was a mirror image asked for
     third = np.array([*middle, [5.0, 6, 3]])
-    assert np.isfinite(judged(place, third, np.full((1, 3), 1e6), bounds_m=box).sd_m[0])
+    assert np.isfinite(judged(place, third, np.full((1, 3), 1e6), mirrors=True).sd_m[0])
+
+
+FLAT = [(0, 0, 3), (10, 0, 3), (10, 8, 3), (0, 8, 3), (5, 4, 3)]
+UNEVEN = [(0, 0, 3), (10, 0, 3.3), (10, 8, 2.8), (0, 8, 3.1), (5, 4, 2.9)]
+LINE = [(1, 4, 3), (9, 4, 3), (5, 4, 3), (3, 4, 2)]
+WALL = [(1, 0.2, 3), (9, 0.2, 3)]
+NEAR_LINE = [(1, 4, 3), (9, 4, 3), (5, 4.3, 3)]
+LOW = [(x, y, 0.5) for x, y, _ in FLAT]
+ROOM = ((0, 0, 0), (10, 8, 4))
+TALL = ((0, 0, 0), (10, 8, 8))
+
+
+@pytest.mark.parametrize("bounds", [None, ROOM, TALL], ids=["open", "room", "tall"])
+@pytest.mark.parametrize(
+    ("nodes", "free_level", "clock", "sd"),
+    [
+        (FLAT, True, False, 1e-3),
+        (FLAT, True, True, 1e-3),
+        (FLAT[:3], True, False, 1e-3),
+        (FLAT, False, False, 1e-3),
+        (UNEVEN, True, False, 1e-3),
+        (UNEVEN, True, True, 0.03),
+        (UNEVEN, True, False, 0.1),
+        (LINE, False, False, 1e-3),
+        (LINE, False, True, 1e-3),
+        (WALL, False, False, 1e-3),
+        (NEAR_LINE, False, False, 0.03),
+        (LOW, True, False, 0.01),
+    ],
+)
+def test_a_fix_is_promised_where_the_receiver_has_one(nodes, free_level, clock, sd, bounds) -> None:
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(0.2, 9.8, 13), np.linspace(0.3, 7.6, 11)))
+    places, nodes = np.column_stack([x, y, np.full(len(x), 0.4)]), np.array(nodes, float)
+    ranges = np.linalg.norm(places[:, None] - nodes, axis=2)
+    got = judged(
+        places,
+        nodes,
+        np.full(ranges.shape, sd**-2),
+        free_level=free_level,
+        clock=clock,
+        mirrors=True,
+        bounds_m=None if bounds is None else np.array(bounds, float),
+        weak=WEAK,
+    )
+    fixes = fix_many(
+        nodes,
+        ranges + (5.0 if clock else 0.0),
+        np.full(len(nodes), sd**2),
+        level_m=None if free_level else 0.4,
+        clock=clock,
+        bounds_m=bounds,
+    )
+    np.testing.assert_array_equal(np.isfinite(got.sd_m), [STATUSES[s] == "ok" for s in fixes.status])
 
 
 def test_a_deviation_as_large_as_the_nearest_range_is_no_fix() -> None:

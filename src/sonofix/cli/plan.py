@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from sonofix.records import Floats, Quality
     from sonofix.site import Site
 
+OUTPUTS = ("plan.csv", "plan.png", "improved.toml")
+
 
 def plan(
     site: Annotated[Path, typer.Argument(help="Site file, or recording folder.")],
@@ -27,12 +29,13 @@ def plan(
         typer.Option("--move", help="Move beacons whose position_sd_m is above 0, too; they count as placed exactly."),
     ] = False,
     goal: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="What --improve betters: error (deviation that 95 % of the floor stays within) or faults (share of the"
-            " floor with a fix where a fault of --fault is detected)."
+            " floor with a fix where a fault of --fault is detected).",
+            show_default="error",
         ),
-    ] = "error",
+    ] = None,
     fault: Annotated[float, typer.Option(help="Fault of one range that is to be detected, m.")] = 0.5,
     places: Annotated[
         Path | None,
@@ -74,7 +77,10 @@ def plan(
         float | None,
         typer.Option(help="Full width of the beacons' beam at -6 dB, degrees.", show_default="alike all round"),
     ] = None,
-    aim: Annotated[str, typer.Option(help="Where beams point: down, or centre (of the floor).")] = "down",
+    aim: Annotated[
+        str | None,
+        typer.Option(help="Where beams point: down, or centre (of the floor).", show_default="down"),
+    ] = None,
     range_sd: Annotated[
         float | None,
         typer.Option(help="Deviation of every range, m, in place of a link budget.", show_default="0.1 without codes"),
@@ -99,9 +105,13 @@ def plan(
     from sonofix.files.plan_writing import write_plan
     from sonofix.plan.quality import quality
 
-    aimed = _goal(goal)
+    aimed = _goal(goal or "error")
+    for name, value in (("--goal", goal), ("--places", places)):
+        if value is not None and improve is None and not move:
+            raise ValueError(f"{name} {value}: nothing is placed without --improve or --move; give one of them")
     if not 0 < fault < 1000:
         raise ValueError(f"--fault {fault:g}: it must be above 0 and below 1000, in m")
+    asked = "--move" if improve is None else f"--improve {improve}"
     if move and improve is None:
         improve = 0
     loudness = Loudness(level, noise_db, rate, snr, beam, aim, range_sd, reach, temperature_sd)
@@ -110,10 +120,13 @@ def plan(
     if moving:  # what is yet to be fastened is not misplaced
         task = replace(task, nodes=task.nodes.placed(moving))
     if improve == 0 and not moving:
-        raise ValueError("--improve 0: nothing to place; ask for one beacon or more, or mark some by position_sd_m")
+        hint = "mark beacons as free by position_sd_m" if move else "give --move and mark beacons by position_sd_m"
+        raise ValueError(f"{asked}: nothing to place; ask for one beacon or more with --improve, or {hint}")
     out = out or task.folder / "plan"
-    if site.resolve() == (out / "improved.toml").resolve():
-        raise ValueError(f"{site}: would be replaced by what is written to {out}; write to another folder with -o")
+    for given in (site, walls, places):
+        if given is not None and given.resolve() in [(out / name).resolve() for name in OUTPUTS]:
+            raise ValueError(f"{given}: would be replaced by what is written to {out}; write to another folder with -o")
+    candidates = None if places is None else _places(places, task)
     after, better, nodes = None, None, task.nodes
     kept = "nothing was written"
     with _bars() as bar:
@@ -125,7 +138,7 @@ def plan(
             kept = f"{out} holds the map of the beacons as they are"
             if improve is not None:
                 on_done = bar("placing beacons")
-                nodes, better = _improved(task, moving, improve, places, aimed, fault, spacing, margin, on_done)
+                nodes, better = _improved(task, moving, improve, candidates, aimed, fault, spacing, margin, on_done)
                 after = quality(task.site, nodes, task.terms, task.level_m, spacing, margin, bar("judging it anew"))
                 write_plan(out, after, better)
         except KeyboardInterrupt:
@@ -138,6 +151,16 @@ def plan(
     if plot:
         _draw(picture, task, nodes, moving, before, after, fault)
     speaker().print(f"Written to {out}")
+
+
+def _places(path: Path, task: Task) -> Floats:
+    """Read where beacons may go; refuse what no beacon can be fastened to."""
+    from sonofix.cli.plan_task import check_places
+    from sonofix.files.floor_plan import read_places
+
+    found = read_places(path)
+    check_places(found, task.site, task.level_m, path)
+    return found
 
 
 def _goal(text: str) -> Literal["error", "faults"]:
@@ -162,7 +185,7 @@ def _improved(
     task: Task,
     moving: list[int],
     count: int,
-    places: Path | None,
+    candidates: Floats | None,
     goal: Literal["error", "faults"],
     fault_m: float,
     spacing_m: float,
@@ -172,13 +195,13 @@ def _improved(
     """Return all nodes with some moved and added, and the site with them."""
     import numpy as np
 
-    from sonofix.files.floor_plan import read_places
     from sonofix.plan.extend import extended, free_ids, rounded
     from sonofix.plan.improve import candidates_of, improve
     from sonofix.plan.quality import Nodes, places_of
 
     walls, nodes = task.terms.walls, task.nodes
-    candidates = candidates_of(task.site, walls, task.level_m) if places is None else read_places(places)
+    if candidates is None:
+        candidates = candidates_of(task.site, walls, task.level_m)
     _, _, floor, open_ = places_of(task.site, walls, task.level_m, spacing_m, margin_m)
     standing = [i for i in range(len(nodes)) if i not in moving]
     found = improve(
@@ -254,7 +277,7 @@ def _tell_places(task: Task, nodes: Nodes, moving: list[int], better: Site) -> N
     bare = [b.id for b in better.beacons if b.id in nodes.ids[old:] and b.code is None]
     if bare and task.site.coded_beacons:
         say.print(f"No code is left for {', '.join(bare)}: give each one; `sonofix codes` chooses them.")
-    elif len(nodes) > old and task.site.coded_beacons:
+    elif len(nodes) > old and any(b.id in nodes.ids[old:] for b in better.beacons) and task.site.coded_beacons:
         say.print("improved.toml gives new beacons the next free codes; `sonofix codes --site` chooses better ones.")
     if any(getattr(b.code, "reference", None) for b in better.beacons):
         say.print("Recorded bursts are named relative to the site file: put improved.toml where site.toml stands.")

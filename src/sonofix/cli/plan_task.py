@@ -8,13 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sonofix.cli.console import counted
+
 if TYPE_CHECKING:
     from sonofix.plan.budget import Budget
     from sonofix.plan.quality import Nodes, Terms
-    from sonofix.records import ReferenceBurst, Walls, Waveform
+    from sonofix.records import Floats, ReferenceBurst, Walls, Waveform
     from sonofix.site import Site
 
 LEVEL, NOISE_DB, RATE_HZ = 0.5, -50.0, 192_000.0
+SLACK_M = 0.01
+"""By which a place may be outside the room: a face of it, rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +30,7 @@ class Loudness:
     rate_hz: float | None = None
     snr: str | None = None
     beam_deg: float | None = None
-    aim: str = "down"
+    aim: str | None = None
     range_sd_m: float | None = None
     reach_m: float | None = None
     temperature_sd_k: float | None = None
@@ -95,7 +99,7 @@ def task_of(path: Path, walls: Path | None, vehicle: str | None, height_m: float
         range_sd_m=None if budget is not None else _range_sd(loudness),
         reach_m=loudness.reach_m,
         aim_m=_aim(site, nodes, level_m) if loudness.aim == "centre" else None,
-        bounds_m=None if site.bounds_m is None else np.array(site.bounds_m)[:, :2],
+        bounds_m=None if site.bounds_m is None else np.array(site.bounds_m),
         walls=plan,
     )
     return Task(site, folder, nodes, terms, level_m, tuple(_sentences(site, nodes, terms, loudness, plan)))
@@ -103,7 +107,7 @@ def task_of(path: Path, walls: Path | None, vehicle: str | None, height_m: float
 
 def _check(loudness: Loudness, height_m: float | None) -> None:
     for name, value, unit in (
-        ("level", loudness.level, "of full scale"),
+        ("level", loudness.level, "parts of full scale"),
         ("rate", loudness.rate_hz, "Hz"),
         ("range-sd", loudness.range_sd_m, "m"),
         ("reach", loudness.reach_m, "m"),
@@ -112,7 +116,7 @@ def _check(loudness: Loudness, height_m: float | None) -> None:
             raise ValueError(f"--{name} {value:g}: it must be above 0, in {unit}")
     if loudness.beam_deg is not None and not 5 <= loudness.beam_deg <= 360:
         raise ValueError(f"--beam {loudness.beam_deg:g}: the full width between -6 dB, from 5 to 360 degrees")
-    if loudness.aim not in ("down", "centre"):
+    if loudness.aim not in (None, "down", "centre"):
         raise ValueError(f"--aim {loudness.aim}: it must be down or centre")
     if loudness.noise_db is not None and not -200 <= loudness.noise_db <= 20:
         raise ValueError(f"--noise-db {loudness.noise_db:g}: it must be from -200 to 20, in dB of full scale")
@@ -122,6 +126,14 @@ def _check(loudness: Loudness, height_m: float | None) -> None:
         raise ValueError(f"--height {height_m}: it must be a number, in m")
     if loudness.snr is not None and (loudness.level is not None or loudness.range_sd_m is not None):
         raise ValueError("--snr sets how loud beacons are, and so do --level and --range-sd; give one of them")
+    if loudness.aim is not None and loudness.beam_deg is None:
+        raise ValueError(f"--aim {loudness.aim}: only beams point anywhere; give --beam as well")
+    if loudness.range_sd_m is not None:
+        shaping = {"--beam": loudness.beam_deg, "--noise-db": loudness.noise_db, "--rate": loudness.rate_hz}
+        given = [name for name, value in {"--level": loudness.level, **shaping}.items() if value is not None]
+        if given:
+            remedy = "stands in place of the link budget, and these would shape it; give one or the other"
+            raise ValueError(f"--range-sd with {', '.join(given)}: --range-sd {remedy}")
 
 
 def _in_room(plan: Walls, site: Site, path: Path) -> Walls:
@@ -137,6 +149,25 @@ def _in_room(plan: Walls, site: Site, path: Path) -> Walls:
                 " coordinates are site metres, not degrees"
             )
     return plan
+
+
+def check_places(places_m: Floats, site: Site, level_m: float, path: Path) -> None:
+    """Raise ValueError, with the place, where one for a beacon is outside the room or below the floor."""
+    import numpy as np
+
+    floor_m = min([v.z_m for v in site.vehicles if v.z_m is not None] or [0.0])
+    floor_m = min(floor_m, level_m)
+    low, high = np.array([-np.inf, -np.inf, floor_m]), np.full(3, np.inf)
+    if site.bounds_m is not None:
+        low, high = np.array(site.bounds_m, float)
+    for place in places_m:
+        if np.all(place >= low - SLACK_M) and np.all(place <= high + SLACK_M):
+            continue
+        where = "({:g}, {:g}, {:g}) m".format(*place)
+        if place[2] < low[2] - SLACK_M:
+            raise ValueError(f"--places {path}: {where} is below the floor, at {low[2]:g} m; correct it")
+        room = "({:g}, {:g}, {:g}) to ({:g}, {:g}, {:g}) m".format(*low, *high)
+        raise ValueError(f"--places {path}: {where} is outside the room, {room}; correct it, or bounds_m")
 
 
 def _read(path: Path) -> tuple[Site, float | None, Mapping[str, ReferenceBurst]]:
@@ -155,7 +186,15 @@ def _budget(
     from sonofix.plan.budget import Budget
     from sonofix.signals.waveform import waveforms_of
 
-    if loudness.range_sd_m is not None or not site.coded_beacons:
+    if loudness.range_sd_m is not None:
+        return None, {}
+    if not site.coded_beacons:
+        budget = {"--level": loudness.level, "--noise-db": loudness.noise_db, "--rate": loudness.rate_hz}
+        options = {**budget, "--beam": loudness.beam_deg, "--snr": loudness.snr}
+        given = [name for name, value in options.items() if value is not None]
+        if given:
+            remedy = "give a [[beacon]] one, or state --range-sd"
+            raise ValueError(f"{', '.join(given)}: no beacon has a code, so there is no link budget; {remedy}")
         return None, {}
     noise_db = NOISE_DB if loudness.noise_db is None else loudness.noise_db
     budget = Budget(
@@ -233,7 +272,15 @@ def _sentences(site: Site, nodes: Nodes, terms: Terms, loudness: Loudness, walls
     if terms.speed_sd:
         told.append(f"The sound speed is known within {100 * terms.speed_sd:.2f} %, which all ranges share.")
     unknown = ["x", "y"] + ["z"] * terms.free_level + ["clock"] * terms.clock
-    obstacles = len(np.unique(walls.solid[walls.solid >= 0]))
-    stand = f"; {obstacles} obstacles and {int(np.sum(walls.solid < 0))} pieces of wall" if len(walls) else ""
+    obstacles, pieces = len(np.unique(walls.solid[walls.solid >= 0])), int(np.sum(walls.solid < 0))
+    pieces_text = f"{pieces} piece{'' if pieces == 1 else 's'} of wall"
+    stand = f"; {counted(obstacles, 'obstacle')} and {pieces_text}" if len(walls) else ""
     told.append(f"Unknown at each place: {', '.join(unknown)}{stand}.")
+    if site.bounds_m is None:
+        low, high = nodes.position_m.min(axis=0), nodes.position_m.max(axis=0)
+        kind = "beacon" if any(b.position_m is not None for b in site.beacons) else "microphone"
+        told.append(
+            f"The map is of the box of the {kind}s, ({low[0]:g}, {low[1]:g}) to ({high[0]:g}, {high[1]:g}) m; bounds_m"
+            " states another, and tells mirror images apart."
+        )
     return told

@@ -12,7 +12,6 @@ import typer
 from sonofix.cli.console import Stopped, counted, drawing, length_text, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-
     from sonofix.records import RangeEpoch, Recording, Survey, SurveyedBeacon
     from sonofix.site import Site
 
@@ -57,7 +56,9 @@ def survey(
             max=30.0,
         ),
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over what is there (never over site.toml).")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write over what is there (never over files of the recording).")
+    ] = False,
     as_json: Annotated[
         Path | None, typer.Option("--json", help="Write all that was found, with covariance, to this file.")
     ] = None,
@@ -82,7 +83,9 @@ def survey(
     source = files.read_recording(recording, to_run=True)
     origin = recording / FILE_NAME
     target = out or recording / "site_corrected.toml"
-    writing.check_new(target, origin, force)
+    picture = target.parent / f"{target.stem}.png"
+    targets = {"site file": target, **({"JSON": as_json} if as_json else {}), **({"picture": picture} if plot else {})}
+    writing.check_targets(targets, recording, source.site, force)
     site = marked(source.site, guess_sd, known or [])
     stated = source.blocks is None
     usual = _STATED_BIAS_M if stated else _SOUND_BIAS_M
@@ -106,8 +109,8 @@ def survey(
         if as_json is not None:
             writing.write_survey(as_json, found)
         written = [target, *([as_json] if as_json else [])]
-        if plot and _draw(target.with_suffix(".png"), site, found):
-            written.append(target.with_suffix(".png"))
+        if plot and _draw(picture, site, found):
+            written.append(picture)
     except KeyboardInterrupt:
         raise Stopped(f"stopped; not all was written beside {target}") from None
     speaker().print(f"\nWritten: {', '.join(map(str, written))}")
@@ -215,7 +218,9 @@ def _draw(picture: Path, site: Site, found: Survey) -> bool:
     """Draw the picture; say so where Matplotlib is not installed."""
     with drawing():
         from sonofix.draw.survey import draw_survey
+        from sonofix.files.survey_writing import write_picture
 
-        draw_survey(found, site.name, site.bounds_m).savefig(picture)
+        figure = draw_survey(found, site.name, site.bounds_m)
+        write_picture(picture, lambda part: figure.savefig(part, format="png"))
         return True
     return False

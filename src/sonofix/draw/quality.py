@@ -24,6 +24,9 @@ GOOD_MAP = LinearSegmentedColormap.from_list("good", ["#123a4a", "#1f8f8a", "#e9
 """From small and good to large and bad: dark green, yellow, orange."""
 
 _NO_FIX = "#5a2430"
+_NOTHING = ("0 %", "no fix")
+"""Figures that are no success."""
+
 _MOST_NAMED = 24
 _SPAN = 50.0
 """A logarithmic map shows at most so many times its least value: what is worse looks alike."""
@@ -278,7 +281,8 @@ def _head(figure: Figure, quality: Quality, before: Quality | None, title: str, 
     for i, ((value, name), was) in enumerate(zip(now[::-1], then[::-1], strict=True)):
         x = 0.985 - (0.13 if before is None else 0.19) * i
         text = value if was is None or was == value else f"{was} → {value}"
-        figure.text(x, 0.952, text, fontsize=17, fontweight="bold", color=style.GOOD, va="center", ha="right")
+        colour = style.EXCLUDED if value in _NOTHING else style.GOOD
+        figure.text(x, 0.952, text, fontsize=17, fontweight="bold", color=colour, va="center", ha="right")
         figure.text(x, 0.922, name, fontsize=9.5, color=style.MUTED, va="center", ha="right")
 
 
@@ -286,7 +290,7 @@ def _key_figures(quality: Quality, fault_m: float) -> list[tuple[str, str]]:
     within = quality.over_floor(quality.sd_m, 95)
     return [
         (_percent(quality.share(quality.fix)), "of the floor with a fix"),
-        (_two_figures(within) if np.isfinite(within) else "no fix", "deviation, 95 % of it within"),
+        (_two_figures(within) if np.isfinite(within) else _NOTHING[1], "deviation, 95 % of it within"),
         (
             _percent(quality.share(quality.fault_m <= fault_m)),
             f"detects a fault of {style.length_text(fault_m)}",

@@ -211,9 +211,9 @@ def _head(figure: Figure, found: Survey, title: str) -> None:
         facts.append("mirror image undecided")
     figure.text(0.05, 0.902, "  ·  ".join(facts), fontsize=12, color=style.MUTED, va="center")
     free = [float(np.sqrt(np.linalg.eigvalsh(b.covariance_m2)[-1])) for b in found.beacons if np.any(b.covariance_m2)]
-    figures = [(style.length_text(found.after_m), "residual, rms")] if np.isfinite(found.after_m) else []
+    figures = [(style.length_text(found.after_m), "residual after, rms")] if np.isfinite(found.after_m) else []
     if np.isfinite(found.before_m):
-        figures.insert(0, (style.length_text(found.before_m), "before"))
+        figures.insert(0, (style.length_text(found.before_m), "residual before survey"))
     if free:
         figures.append((style.length_text(max(free)), "worst deviation"))
     for i, (value, name) in enumerate(figures[::-1]):

@@ -21,6 +21,9 @@ from sonofix.records import Floats, Walls
 MOST_PROBLEMS = 5
 """Told of one file."""
 
+FARTHEST_M = 1e6
+"""No site is larger."""
+
 _KINDS = ("LineString", "MultiLineString", "Polygon", "MultiPolygon")
 
 
@@ -50,7 +53,7 @@ def read_walls(path: str | Path) -> Walls:
     RecordingError
         With the file's mistakes, each with the feature and the field.
     """
-    judge = _Judge(Path(path).name)
+    judge = _Judge(Path(path).name or str(path))
     lines: list[tuple[Floats, float, int]] = []
     solids = 0
     for field, geometry, properties in _features(Path(path), judge):
@@ -101,7 +104,7 @@ def read_places(path: str | Path) -> Floats:
     if path.suffix.lower() == ".csv":
         table = read_table(path, Layout(columns, given=columns, order=None), None)
         return np.column_stack([table.columns[name] for name in columns])
-    judge = _Judge(path.name)
+    judge = _Judge(path.name or str(path))
     found: list[Floats] = []
     for field, geometry, _ in _features(path, judge):
         kind = geometry.get("type")
@@ -119,9 +122,10 @@ def read_places(path: str | Path) -> Floats:
 
 def _features(path: Path, judge: _Judge) -> Iterator[tuple[str, Mapping[str, Any], Mapping[str, Any]]]:
     """Yield where, geometry and properties of each feature of a file; collections of geometries are opened."""
-    text = read_text(path, path.name)
+    text = read_text(path, path.name or str(path))
     try:
-        held = json.loads(text)
+        # whole numbers may be of any length: what no site can hold is a float, infinite at last
+        held = json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 16 else float(digits))
     except (json.JSONDecodeError, RecursionError) as error:
         where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
         why = error.msg if isinstance(error, json.JSONDecodeError) else "nested too deeply"
@@ -156,8 +160,9 @@ def _features(path: Path, judge: _Judge) -> Iterator[tuple[str, Mapping[str, Any
 def _height(value: object, field: str, judge: _Judge) -> float:
     if value is None:
         return math.inf
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        judge.tell(f"{field} height_m", value, "must be a number above 0, in m; leave it out for walls to the ceiling")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= FARTHEST_M:
+        remedy = f"must be a number above 0 and up to {FARTHEST_M:g}, in m; leave it out for walls to the ceiling"
+        judge.tell(f"{field} height_m", value, remedy)
         return math.inf
     return float(value)
 
@@ -179,9 +184,13 @@ def _points(line: object, field: str, judge: _Judge, least: int, size: int = 2) 
         return None
     for point in line:
         numbers = isinstance(point, list) and all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in point
+            isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= FARTHEST_M for v in point
         )
         if not numbers or len(point) < size:
-            judge.tell(field, point, f"a point is {'[x, y, z]' if size == 3 else '[x, y]'}, numbers in m")
+            judge.tell(
+                field,
+                point,
+                f"a point is {'[x, y, z]' if size == 3 else '[x, y]'}, numbers in m, within {FARTHEST_M:g}",
+            )
             return None
     return np.array([point[:size] for point in line], float)

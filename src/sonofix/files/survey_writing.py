@@ -4,34 +4,78 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from sonofix.files.audio import CAPTURE_NAMES
 from sonofix.files.problem import Problem, RecordingError
-from sonofix.files.site_file import parse_site, site_text
+from sonofix.files.site_file import FILE_NAME, parse_site, site_text
+from sonofix.files.tables import LAYOUTS
 from sonofix.files.writing import told
 from sonofix.records import Survey
-from sonofix.site import Beacon, Microphone, Site
+from sonofix.site import Beacon, Microphone, ReferenceCode, Site
 
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([A-Za-z0-9_.\-\"' ]+?)\s*\]\]?\s*(#.*)?$")
 _KEYS = ("position_m", "position_sd_m", "delay_s")
 
 
-def check_new(path: Path, source: Path, replacing: bool) -> None:
-    """Refuse to write over the recording's own site file, or over any file unless told to.
+def check_targets(targets: Mapping[str, Path], folder: Path, site: Site, replacing: bool) -> None:
+    """Refuse to write where it would destroy something, before any work is done.
+
+    Parameters
+    ----------
+    targets : mapping from what is written ("site file", "picture", …) to where
+    folder : Path
+        Of the recording: none of the files it is read from is ever replaced.
+    site : Site
+        It names the recording's references.
+    replacing : bool
+        Whether other files that are there may be replaced.
 
     Raises
     ------
     RecordingError
+        Two targets are one file; one is a file of the recording, a folder, there already, or cannot be written.
     """
-    if path.exists() and source.exists() and path.samefile(source):
-        raise RecordingError([Problem(str(path), "", None, "is the survey's own site file; write beside it with -o")])
-    if path.is_dir():
-        raise RecordingError([Problem(str(path), "", None, "is a folder; name a file with -o")])
-    if path.exists() and not replacing:
-        raise RecordingError([Problem(str(path), "", None, "is there already; give --force, or another name with -o")])
+    own = [folder / name for name in (FILE_NAME, *CAPTURE_NAMES, *(f"{stem}.csv" for stem in LAYOUTS))]
+    own += [folder / b.code.reference for b in site.beacons if isinstance(b.code, ReferenceCode)]
+    seen: dict[str, Path] = {}
+    for what, path in targets.items():
+        with told(path.parent, path.name):
+            for other, taken in seen.items():
+                if _same(path, taken):
+                    _refuse(path, f"is where the {other} goes, and the {what} too; give each its own file")
+            seen[what] = path
+            for file in own:
+                if _same(path, file):
+                    remedy = f"is the survey's own {file.name}; write the {what} beside it, under another name"
+                    _refuse(path, remedy)
+            if path.is_dir():
+                _refuse(path, f"is a folder; name a file for the {what}")
+            if path.exists() and not replacing:
+                _refuse(path, f"is there already; give --force, or another name for the {what}")
+            _try(path)
+
+
+def _refuse(path: Path, remedy: str) -> None:
+    raise RecordingError([Problem(str(path), "", None, remedy)])
+
+
+def _same(a: Path, b: Path) -> bool:
+    """Whether two paths are one file, there or not: links, and names that the file system takes as one, counted."""
+    return a.resolve() == b.resolve() or (a.exists() and b.exists() and a.samefile(b))
+
+
+def _try(path: Path) -> None:
+    """Write a file of no name where the path will be, or as near above it as there is a folder."""
+    folder = path.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def corrected_text(text: str, before: Site, after: Site) -> str:
@@ -193,12 +237,33 @@ def _number(value: float) -> float | None:
     return value if abs(value) < float("inf") else None
 
 
+def write_picture(path: str | Path, save: Callable[[Path], None]) -> None:
+    """Have a picture saved; it is there whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    save : callable
+        Writes the picture, in PNG whatever the name, to the path it is given.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    """
+    _made(Path(path), save)
+
+
 def _write(path: Path, text: str) -> None:
+    _made(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def _made(path: Path, make: Callable[[Path], object]) -> None:
     with told(path.parent, path.name):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f"{path.name}.part")
         try:
-            part.write_text(text, encoding="utf-8")
+            make(part)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)

@@ -89,9 +89,11 @@ def candidates_of(site: Site, walls: Walls, level_m: float) -> Floats:
     corners = np.array(site.bounds_m or nodes, float)
     low, high = corners.min(axis=0), corners.max(axis=0)
     if high[2] <= level_m:
+        ends = "bounds_m ends" if site.bounds_m else "what is fixed, in place of bounds_m, ends"
+        remedy = "correct bounds_m" if site.bounds_m else "state bounds_m"
         raise ValueError(
-            f"bounds_m ends at {high[2]:g} m, not above the map's level of {level_m:g} m: no wall nor ceiling to fasten"
-            " beacons to; correct bounds_m, or give --places"
+            f"{ends} at {high[2]:g} m, not above the map's level of {level_m:g} m: no wall nor ceiling to fasten"
+            f" beacons to; {remedy}, or give --places"
         )
     size = high - low
     apart = max(np.sqrt(size[0] * size[1] / (0.6 * MOST_CANDIDATES)), (size[0] + size[1]) / (0.1 * MOST_CANDIDATES))

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.plan.mirror import inverse, undecided
 from sonofix.records import Floats
 
 NO_FIX_HDOP = 1e4
@@ -54,6 +55,7 @@ def judged(
     free_level: bool = False,
     clock: bool = False,
     speed_sd: float = 0.0,
+    mirrors: bool = False,
     bounds_m: Floats | None = None,
     shift: Floats | None = None,
     weak: float = np.inf,
@@ -70,9 +72,12 @@ def judged(
         Whether the height, and an offset of all ranges, are unknown too.
     speed_sd : float
         Relative deviation of the sound speed.
-    bounds_m : float64 (2, 2), optional
-        Corners (x, y) of the room. Given, a place is no fix where all beacons heard stand on one line and the mirror
-        place behind that line is inside as well, so that nothing tells the two apart.
+    mirrors : bool
+        Whether a place is no fix where the mirror image behind the plane (the line, where the level is known) of the
+        beacons heard fits alike, as `locate.fix` judges it. Other twins (three beacons and an unknown clock) are not
+        looked for.
+    bounds_m : float64 (2, 3), optional
+        Corners of the room. They decide where one of the two lies inside, and nothing where both do.
     shift : float64 (k,), optional
         ``[d]``: shift of the residuals, in deviations, that is detected with d degrees of freedom; without it no
         faults are judged. Beyond its end the last one holds.
@@ -86,76 +91,22 @@ def judged(
     weight = np.ascontiguousarray(weight, dtype=np.float64)
     if weight.shape != (len(places_m), len(nodes_m)):
         raise ValueError(f"weight has shape {weight.shape}; {len(places_m)} places and {len(nodes_m)} nodes need that")
-    box = np.full((2, 2), np.nan) if bounds_m is None else np.asarray(bounds_m, float)
+    box = np.full((2, 3), np.nan) if bounds_m is None else np.array(bounds_m, float)
+    if box.shape != (2, 3):
+        raise ValueError(f"bounds_m has shape {box.shape}; give two corners of the room: (2, 3)")
     heard, out = np.zeros(len(places_m), np.int64), np.full((len(places_m), 5), np.nan)
     table = np.zeros(0) if shift is None else np.asarray(shift, float)
     places, nodes = (np.ascontiguousarray(a, dtype=np.float64) for a in (places_m, nodes_m))
-    _judge(places, nodes, weight, free_level, clock, float(speed_sd), box, table, float(weak), heard, out)
+    unknown = (3 if free_level else 2, clock, float(speed_sd))
+    _judge(places, nodes, weight, unknown, (mirrors, box), table, float(weak), heard, out)
     return Judgement(heard, *out.T)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _inverse(matrix, n, out):
-    """Invert the (n, n) corner of ``matrix`` (its lower triangle) by Cholesky; say whether it has an inverse."""
-    root, scale = np.zeros((5, 5)), np.zeros(5)
-    for i in range(n):
-        if not matrix[i, i] > 0.0:
-            return False
-        scale[i] = 1.0 / np.sqrt(matrix[i, i])
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j] * scale[i] * scale[j]
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            if i > j:
-                root[i, j] = total / root[j, j]
-            elif total > 1e-14:
-                root[i, i] = np.sqrt(total)
-            else:
-                return False
-    # inverse of the triangle, in place; then its product with its transpose
-    for j in range(n):
-        root[j, j] = 1.0 / root[j, j]
-        for i in range(j + 1, n):
-            total = 0.0
-            for k in range(j, i):
-                total -= root[i, k] * root[k, j]
-            root[i, j] = total / root[i, i]
-    for i in range(n):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(i, n):
-                total += root[k, i] * root[k, j]
-            out[i, j] = out[j, i] = total * scale[i] * scale[j]
-    return True
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _mirrored_inside(place, nodes, weight, count, box):
-    """Whether the nodes heard stand on one line in plan, and the place's mirror image behind it is in the room."""
-    mx = my = 0.0
-    for b in range(len(nodes)):
-        if weight[b] > 0.0:
-            mx += nodes[b, 0] / count
-            my += nodes[b, 1] / count
-    xx = xy = yy = 0.0
-    for b in range(len(nodes)):
-        if weight[b] > 0.0:
-            dx, dy = nodes[b, 0] - mx, nodes[b, 1] - my
-            xx += dx * dx
-            xy += dx * dy
-            yy += dy * dy
-    if xx * yy - xy * xy > 1e-6 * (xx + yy) ** 2 or xx + yy == 0.0:
-        return False
-    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
-    off = -(place[0] - mx) * np.sin(angle) + (place[1] - my) * np.cos(angle)
-    x, y = place[0] + 2.0 * off * np.sin(angle), place[1] - 2.0 * off * np.cos(angle)
-    return x > box[0, 0] and x < box[1, 0] and y > box[0, 1] and y < box[1, 1]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _judge(places, nodes, weight, free_level, clock, speed_sd, box, shift, weak, heard, out):
-    places_unknown = 3 if free_level else 2
+def _judge(places, nodes, weight, unknowns, twins, shift, weak, heard, out):
+    places_unknown, clock, speed_sd = unknowns
+    free_level = places_unknown == 3
+    mirrors, box = twins
     unknown = places_unknown + (1 if clock else 0)
     states = unknown + (1 if speed_sd > 0.0 else 0)
     rows = np.zeros((len(nodes), 5))
@@ -190,7 +141,7 @@ def _judge(places, nodes, weight, free_level, clock, speed_sd, box, shift, weak,
             nearest = min(nearest, distance)
             n += 1
         heard[p] = n
-        if n < unknown or not _inverse(plain, unknown, unit_covariance):
+        if n < unknown or not inverse(plain, unknown, unit_covariance):
             continue
         hdop2 = unit_covariance[0, 0] + unit_covariance[1, 1]
         vdop2 = unit_covariance[2, 2] if free_level else 0.0
@@ -198,18 +149,21 @@ def _judge(places, nodes, weight, free_level, clock, speed_sd, box, shift, weak,
             continue
         if speed_sd > 0.0:
             full[unknown, unknown] += 1.0 / speed_sd**2
-        if not _inverse(full, states, covariance):
+        if not inverse(full, states, covariance):
             continue
         worst = max(covariance[0, 0], covariance[1, 1])
         if free_level:
             worst = max(worst, covariance[2, 2])
         if worst > (weak * max(nearest, 0.2)) ** 2:
             continue
-        if not clock and not np.isnan(box[0, 0]) and _mirrored_inside(places[p], nodes, weight[p], n, box):
-            continue
+        half = 0.0
+        if mirrors:
+            unsure, half = undecided(places[p], nodes, weight[p], n, unknowns, box)
+            if unsure:
+                continue
         out[p, 0], out[p, 1] = np.sqrt(hdop2), np.sqrt(vdop2)
         out[p, 2] = np.sqrt(covariance[0, 0] + covariance[1, 1])
-        out[p, 3] = np.sqrt(covariance[2, 2]) if free_level else 0.0
+        out[p, 3] = np.sqrt(covariance[2, 2] + half**2) if free_level else 0.0
         if not len(shift):
             continue
         if n == unknown:

@@ -90,7 +90,7 @@ class Terms:
         Greatest way over which ranges are had at all, whatever the budget.
     aim_m : (x, y, z) or None
         What fixed transducers with a beam face; None: straight down (up, for those below the map).
-    bounds_m : float64 (2, 2) or None
+    bounds_m : float64 (2, 3) or None
     walls : Walls
     """
 
@@ -269,6 +269,7 @@ def judge(nodes_m: Floats, weight: Floats, places_m: Floats, terms: Terms, shift
         free_level=terms.free_level,
         clock=terms.clock,
         speed_sd=terms.speed_sd,
+        mirrors=True,
         bounds_m=terms.bounds_m,
         shift=shift,
         weak=WEAK,

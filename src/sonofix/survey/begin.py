@@ -22,22 +22,76 @@ from sonofix.survey.rows import Drive
 Indices = NDArray[np.int64]
 
 MOST_COLUMNS = 400
+LEAST_COLUMNS = 12
+"""Epochs in which the same beacons are heard together, from which places can be had."""
+
 TRIES = 16
+STOOD_M = 0.05
+"""A vehicle none of whose ranges changes by more stood still."""
+
 THIN = 0.01
 """Share of its length by which a drive must be wide to tell sideways from along by ranges alone."""
+
+
+def untellable(drive: Drive, movable: int, biases: int) -> str:
+    """Why a drive cannot tell what is asked, by its count of rows; empty where it may.
+
+    A vehicle that stood brings one row for each pair of ends, however often it was heard.
+
+    Parameters
+    ----------
+    drive : Drive
+    movable, biases : int
+        Fixed ends that may move, and delays to find.
+    """
+    kinds = list(zip(drive.emitter, drive.receiver, strict=True))
+    pairs = {pair: i for i, pair in enumerate(dict.fromkeys(kinds))}
+    pair = np.array([pairs[kind] for kind in kinds])
+    range_m = drive.range_m.copy()
+    if drive.common_clock:
+        for index in np.unique(drive.epoch):
+            range_m[drive.epoch == index] -= np.mean(range_m[drive.epoch == index])
+    change_m = max(float(np.ptp(range_m[pair == i])) for i in range(len(pairs)))
+    stood = change_m < max(STOOD_M, 6.0 * float(np.median(drive.range_sd_m)))
+    first = np.unique(drive.state_vehicle, return_index=True)[1]
+    places = int(np.sum(np.where(np.isnan(drive.level_m[first]), 3, 2) + drive.turns[first]))
+    unknown = 3 * movable + biases + places + drive.common_clock
+    count = len(pairs) if stood else int(np.isfinite(drive.range_m).sum() + np.isfinite(drive.rate_mps).sum())
+    if count > unknown:
+        return ""
+    parts = [
+        f"{number} {name}{'s' if number > 1 else ''}"
+        for number, name in ((movable, "guessed place"), (biases, "delay"), (len(first), "vehicle"))
+        if number
+    ]
+    against = f"{count} different range{'s' if count > 1 else ''} for {unknown} unknowns ({', '.join(parts)})"
+    remedy = "record a drive of half a minute or more, all over the hall"
+    epochs = len(np.unique(drive.epoch))
+    if epochs == 1:
+        return f"one epoch alone is heard, which brings {against}; {remedy}"
+    if stood:
+        told = f"the vehicle stood still: over {epochs} epochs no range changes by more than {1e3 * change_m:.0f} mm"
+        return f"{told}, which leaves {against}; {remedy}"
+    return f"too little is heard: {count} ranges and range rates for {unknown} unknowns ({', '.join(parts)}); {remedy}"
 
 
 def placed_states(drive: Drive, site: Site, epochs: Sequence[RangeEpoch]) -> tuple[Floats, Floats] | None:
     """States (s, 11) from fixes by the site's beacons, and the clock (3,); None where no epoch has one.
 
-    Epochs without a fix lie between their neighbours'.
+    Epochs without a fix lie between their neighbours'. Where every epoch has two mirror images that fit alike, those
+    below the beacons count: whether the others are the true ones is asked once all is adjusted.
     """
     states = np.full((len(drive.state_time_s), 11), np.nan)
     offsets: list[tuple[float, float]] = []
     names = [v.id for v in site.vehicles]
     arms = open_arms(site)
-    for i, (vehicle, index) in enumerate(zip(drive.state_vehicle, drive.state_epoch, strict=True)):
-        found = fix(epochs[index], site, names[vehicle])
+    asked = [(epochs[k], names[v]) for v, k in zip(drive.state_vehicle, drive.state_epoch, strict=True)]
+    fixes = [fix(epoch, site, name) for epoch, name in asked]
+    if all(found.position_m is None for found in fixes):
+        below = _below(site, drive)
+        fixes = [fix(epoch, below, name) for epoch, name in asked]
+    for i, found in enumerate(fixes):
+        vehicle = drive.state_vehicle[i]
         if found.position_m is None:
             continue
         states[i] = 0.0
@@ -75,6 +129,14 @@ def placed_states(drive: Drive, site: Site, epochs: Sequence[RangeEpoch]) -> tup
     return states, clock
 
 
+def _below(site: Site, drive: Drive) -> Site:
+    """Return the site with a room that ends at the middle height of its fixed ends, so that a fix lies below them."""
+    low, high = (np.full(3, -np.inf), np.full(3, np.inf)) if site.bounds_m is None else np.array(site.bounds_m, float)
+    high = np.array([*high[:2], min(high[2], float(np.median(drive.place_m[np.unique(drive.point), 2])))])
+    section = site.section.model_copy(update={"bounds_m": (tuple(low.tolist()), tuple(high.tolist()))})
+    return site.model_copy(update={"section": section})
+
+
 def from_ranges(drive: Drive, rng: np.random.Generator) -> tuple[dict[int, Floats], str]:
     """Places of fixed ends in a frame of their own, from ranges alone.
 
@@ -90,6 +152,12 @@ def from_ranges(drive: Drive, rng: np.random.Generator) -> tuple[dict[int, Float
     table, level = _table(drive)
     core = _core(table)
     if core is None:
+        columns = table.shape[1]
+        if columns < LEAST_COLUMNS:
+            return {}, (
+                f"{columns} epochs are heard; from ranges alone it takes {LEAST_COLUMNS} or more, from places all over"
+                " the hall: record a longer drive, or give position_m within a metre"
+            )
         return {}, "too few beacons are heard together; three at least are needed on a known level, else five"
     rows, columns = core
     best: tuple[float, dict[int, Floats]] | None = None
@@ -97,7 +165,7 @@ def from_ranges(drive: Drive, rng: np.random.Generator) -> tuple[dict[int, Float
     for attempt in range(TRIES):
         take = columns
         if attempt:
-            size = max(12, int(len(columns) * (0.8 if attempt < 4 else 0.4)))
+            size = max(LEAST_COLUMNS, int(len(columns) * (0.8 if attempt < 4 else 0.4)))
             take = rng.choice(columns, min(size, len(columns)), replace=False)
         found, reason = _factored(table[np.ix_(rows, take)], level)
         if found is None:
@@ -146,10 +214,12 @@ def _core(table: Floats) -> tuple[Indices, Indices] | None:
     best = None
     for count in range(len(rows), 2, -1):
         columns = np.flatnonzero(heard[rows[:count]].all(axis=0))
-        if len(columns) >= max(12, 30 if best is None else 0) or (len(columns) >= 12 and count == 3):
+        if len(columns) >= max(LEAST_COLUMNS, 30 if best is None else 0) or (
+            len(columns) >= LEAST_COLUMNS and count == 3
+        ):
             best = rows[:count], columns
             break
-        if len(columns) >= 12 and best is None:
+        if len(columns) >= LEAST_COLUMNS and best is None:
             best = rows[:count], columns
     if best is None:
         return None

@@ -13,7 +13,7 @@ from sonofix.ranging import with_sound_speed
 from sonofix.records import Floats, RangeEpoch, Survey
 from sonofix.site import Beacon, Site
 from sonofix.survey import gauge
-from sonofix.survey.begin import from_ranges, placed_states
+from sonofix.survey.begin import from_ranges, placed_states, untellable
 from sonofix.survey.bundle import adjust
 from sonofix.survey.conclude import conclude, failed
 from sonofix.survey.rows import Drive, Guess, gather
@@ -101,6 +101,9 @@ def survey(
     drive = gather(site, epochs)
     fixed = [b for b in site.beacons if b.vehicle is None]
     movable = np.array([i for i, b in enumerate(fixed) if b.position_sd_m > 0 and i in set(drive.point)], np.int64)
+    nothing = untellable(drive, len(movable), _task(drive, movable, wishes, fixed).biases)
+    if nothing:
+        return failed(site, drive, nothing)
     rough = not wishes.ignore_guesses and all(fixed[i].position_sd_m <= ROUGH_M for i in movable)
     why = ""
     before = _placed(drive, site, epochs, wishes, drive.place_m) if rough or not len(movable) else None
