@@ -47,6 +47,21 @@ def test_several_gross_errors_among_many_rows_are_left_out(faulty: tuple, rng: n
     assert error_m @ np.linalg.solve(found.covariance, error_m) < 36
 
 
+@pytest.mark.parametrize("rate_sd_mps", [None, 0.003, 0.05, 0.3])
+@pytest.mark.parametrize("by_m", [0.1, -0.1, 0.2])
+def test_a_fault_that_cannot_be_placed_is_told_however_loose_the_rates_are(
+    by_m: float, rate_sd_mps: float | None
+) -> None:
+    # two beacons south, two east: one of the eastern pair is wrong, and either may be
+    pairs, bounds = ((5.0, 0.0, 1.0), (5.1, -1.0, 1.0), (11.0, 4.0, 1.0), (12.0, 4.1, 1.0)), ((0, -5, 0), (15, 12, 3))
+    site = make_site(pairs, level_m=1.0, bounds_m=bounds)
+    epoch = make_epoch(site, Drive((5.0, 4.0, 1.0)), sd_m=0.003, rate_sd_mps=rate_sd_mps)
+    found = fix(shifted(epoch, 2, by_m), site, "v")
+    assert found.status == "inconsistent"
+    assert "which cannot be told" in found.remedy
+    assert found.hpl_m is None
+
+
 def test_disagreement_without_a_culprit_is_told_and_widens_the_fix(rng: np.random.Generator) -> None:
     # ranges that all err by 20 cm while claiming 1 cm: no single row mends that
     site = make_site(MANY)

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy.stats import ncx2
+from scipy.stats import binom, ncx2
 
 from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site, rows_of, shifted
 from sonofix.locate.fix import fix
@@ -19,6 +19,7 @@ from sonofix.locate.integrity import (
     slopes,
     threshold,
 )
+from sonofix.locate.many import fix_many
 from sonofix.records import Floats
 
 PLACE = (3.0, 5.5, 1.1)
@@ -188,5 +189,31 @@ def test_a_level_holds_the_mirror_that_one_wrong_range_could_choose() -> None:
     assert found.hpl_m > 2.4
 
 
-def test_false_alarm_rate_is_below_what_is_asked() -> None:
-    assert FALSE_ALARM <= 1e-3
+def test_ranges_without_fault_alarm_as_seldom_as_stated(rng: np.random.Generator) -> None:
+    epochs, sd_m, asked = 100_000, 0.01, 1e-3
+    places = np.column_stack([rng.uniform((0.5, 0.5), (9.5, 7.5), (epochs, 2)), np.full(epochs, PLACE[2])])
+    ranges = np.linalg.norm(places[:, None] - np.array(HALL), axis=2) + sd_m * rng.standard_normal((epochs, 6))
+    found = fix_many(HALL, ranges, np.full(6, sd_m**2), level_m=PLACE[2])
+    alarms = np.count_nonzero((found.status != 0) | ~found.used.all(axis=1))
+    assert alarms <= binom.ppf(1 - 1e-6, epochs, FALSE_ALARM) < asked * epochs
+
+
+@pytest.mark.parametrize(("beacons", "level_given"), [(20, True), (40, False)])
+def test_too_many_ways_to_be_wrong_give_no_level(beacons: int, level_given: bool, rng: np.random.Generator) -> None:
+    # three wrong ranges left out: 680 ways for three more among 17, 7770 among 37
+    site = make_site(rng.uniform((0, 0, 0), (10, 8, 3.2), (beacons, 3)), level_m=PLACE[2])
+    epoch = make_epoch(site, Drive(PLACE), rng=rng)
+    for row, by_m in ((2, 1.0), (7, 4.0), (11, -2.0)):
+        epoch = shifted(epoch, row, by_m)
+    found = fix(epoch, site, "v")
+    assert found.status == "ok"
+    assert np.flatnonzero(~found.used).tolist() == [2, 7, 11]
+    assert (found.hpl_m is not None) == level_given
+
+
+def test_more_ways_than_are_looked_at_are_not_listed(rng: np.random.Generator) -> None:
+    jacobian = rng.standard_normal((60, 3))
+    # 60 over 30 is 1e17: only a count can tell
+    assert protection_levels(jacobian, np.eye(60), (0, 1), 2, faults=30) == (np.inf, np.inf)
+    # where there is no fault, there is nothing to choose
+    assert protection_levels(jacobian, np.eye(60), (0, 1), faults=30, fault_probability=0.0)[0] < np.inf

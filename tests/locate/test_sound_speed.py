@@ -99,6 +99,16 @@ def test_what_is_learnt_carries_over_and_is_reported(off_mps: float, rng: np.ran
     assert float(told[0].detail.split()[0]) == pytest.approx(SPEED, rel=1e-3)
 
 
+@pytest.mark.parametrize("off_mps", [-2.4, 0.3])
+def test_the_first_epoch_counts_once(off_mps: float, rng: np.random.Generator) -> None:
+    epoch = wrong(noisy(rng), off_mps)
+    asked, (first,), _ = SoundSpeed().take(epoch, lambda e: (fix(e, SITE, "v"),))
+    # a thermometer that tells next to nothing: what these ranges know by themselves, which no second look adds to
+    alone = fix(with_sound_speed(epoch, asked.sound_speed_mps, 100 * SD_MPS), SITE, "v")
+    assert first.sound_speed_sd_mps == pytest.approx(alone.sound_speed_sd_mps, rel=2e-3)
+    assert first.sound_speed_mps == pytest.approx(alone.sound_speed_mps, abs=0.02 * alone.sound_speed_sd_mps)
+
+
 def test_ranges_without_redundancy_leave_the_thermometer_alone(rng: np.random.Generator) -> None:
     bare, air = make_site(HALL[:3], bounds_m=((0.0, 0.0, 0.0), (10.0, 8.0, 3.2))), SoundSpeed()
     epoch = wrong(noisy(rng, bare), 1.0)

@@ -16,7 +16,7 @@ LEFT = [(0.0, 0.0, 3.0), (8.0, 0.5, 2.7), (7.0, 6.0, 3.1), (1.0, 5.5, 2.9)]
 RIGHT = [(24.0, 1.0, 3.0), (33.0, 0.0, 2.7), (30.0, 6.0, 3.1), (25.0, 4.0, 2.9)]
 
 
-def site() -> Site:
+def site(right: list[tuple[float, float, float]] = RIGHT, near: list[tuple[float, float, float]] | None = None) -> Site:
     codes = [{"chips": chips} for chips in ("0111", "0011", "0101", "0001")]
     return Site.model_validate(
         {
@@ -26,7 +26,7 @@ def site() -> Site:
             "vehicle": [{"id": "v", "z_m": 0.5}],
             "beacon": [
                 {"id": f"{zone}{k}", "zone": zone, "position_m": place, "code": codes[k]}
-                for zone, places in (("L", LEFT), ("R", RIGHT))
+                for zone, places in (("L", LEFT), ("R", right), ("N", near or []))
                 for k, place in enumerate(places)
             ],
             "microphone": [{"id": "M", "vehicle": "v"}],
@@ -56,7 +56,7 @@ def heard(place: tuple[float, float, float], zone: str, wrap_m: float = 0.0) -> 
     )
 
 
-def mates(emitter: str) -> list[tuple[str, float]]:
+def mates(emitter: str, receiver: str) -> list[tuple[str, float]]:
     return [(emitter, 0.0), ("R" + emitter[1:], 0.0)]
 
 
@@ -72,7 +72,7 @@ def test_the_zone_is_told(place: tuple[float, float, float], zone: str) -> None:
 def test_periods_are_told() -> None:
     wrap_m = 6.0
     epoch = heard((3.0, 2.0, 0.5), "L", wrap_m)
-    told, _ = tell_whose(epoch, site(), lambda e: [(e, n * wrap_m / SPEED) for n in range(3)])
+    told, _ = tell_whose(epoch, site(), lambda e, r: [(e, n * wrap_m / SPEED) for n in range(3)])
     found = fix(told, site(), "v")
     assert found.position_m == pytest.approx((3.0, 2.0, 0.5), abs=0.01)
     assert set(told.emitter) == set(epoch.emitter)
@@ -94,9 +94,20 @@ def test_two_that_make_as_much_sense_give_none() -> None:
     assert "cannot be told" in text
 
 
+def test_zones_that_repeat_exactly_are_not_told_apart_but_for_who_is_nearer() -> None:
+    """Each position has all four ranges; beacons of the same codes nearer to one of them would be heard there."""
+    again = [(x + 24.0, y, z) for x, y, z in LEFT]
+    near = [(x + 26.0, 2.0, 2.5) for x, _, _ in LEFT]
+    epoch = heard((3.0, 2.0, 0.5), "L")
+    told, _ = tell_whose(epoch, site(again), mates)
+    assert len(told) == 0
+    told, _ = tell_whose(epoch, site(again, near), lambda e, r: [*mates(e, r), ("N" + e[1:], 0.0)])
+    assert set(told.emitter) == {"L0", "L1", "L2", "L3"}
+
+
 def test_nothing_to_decide_says_nothing() -> None:
     epoch = heard((3.0, 2.0, 0.5), "L")
-    told, text = tell_whose(epoch, site(), lambda e: [(e, 0.0)])
+    told, text = tell_whose(epoch, site(), lambda e, r: [(e, 0.0)])
     assert text == ""
     assert told.emitter == epoch.emitter
     np.testing.assert_allclose(told.range_m, epoch.range_m)

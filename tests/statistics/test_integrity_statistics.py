@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import binom
 
 from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site
+from sonofix.locate.exclude import APART_SIGMA
 from sonofix.locate.fix import fix
 from sonofix.locate.integrity import minimum_detectable_bias
 from sonofix.locate.many import fix_many
@@ -23,6 +24,9 @@ SD_M = 0.01
 STRAIGHT_M = 0.3
 """Where the least bias is larger, the few ranges left bend before it is reached: its linear model says little."""
 
+TWO_BY_TWO = ((5.0, 0.0, 1.0), (5.1, -1.0, 1.0), (11.0, 4.0, 1.0), (12.0, 4.1, 1.0))
+"""Where one of a pair is wrong, the pair tells that, but not which of the two."""
+
 EIGHT = (*HALL, (0.0, 4.0, 1.5), (10.0, 4.0, 2.9))
 
 
@@ -30,7 +34,7 @@ EIGHT = (*HALL, (0.0, 4.0, 1.5), (10.0, 4.0, 2.9))
 class Case:
     site: Site
     clock_m: float | None = None
-    faults: int = 1
+    rate_sd_mps: float | None = None
 
 
 def _site(anchors: tuple, level_m: float | None = None) -> Site:
@@ -44,6 +48,9 @@ CASES = {
     "space, eight": Case(_site(EIGHT)),
     "space, five": Case(_site(HALL[:5])),
     "space, TDoA, eight": Case(_site(EIGHT), clock_m=30.0),
+    "level, two by two, rates": Case(_site(TWO_BY_TWO, 1.1), rate_sd_mps=0.05),
+    "level, four, rates": Case(_site(HALL[:4], 1.1), rate_sd_mps=0.2),
+    "space, eight, rates": Case(_site(EIGHT), rate_sd_mps=0.05),
 }
 
 
@@ -60,12 +67,19 @@ def drawn(case: Case, rng: np.random.Generator) -> tuple[RangeEpoch, Floats, Flo
     place = rng.uniform((0.5, 0.5, 0.2), (9.5, 7.5, 2.0))
     place[2] = place[2] if level_m is None else level_m
     anchors = np.array([b.position_m for b in case.site.beacons])
-    exact = EXACT.setdefault(id(case), make_epoch(case.site, Drive(place), sd_m=SD_M, clock_m=case.clock_m))
+    exact = EXACT.setdefault(
+        id(case), make_epoch(case.site, Drive(place), sd_m=SD_M, rate_sd_mps=case.rate_sd_mps, clock_m=case.clock_m)
+    )
     range_m = np.linalg.norm(place - anchors, axis=1) + (case.clock_m or 0.0) + SD_M * rng.standard_normal(len(anchors))
     least = minimum_detectable_bias(
         jacobian(case.site, place, case.clock_m is not None, level_m is not None), exact.covariance_m2
     )
-    return replace(exact, range_m=range_m), place, least
+    if case.rate_sd_mps is None:
+        return replace(exact, range_m=range_m), place, least
+    away = (place - anchors) / np.linalg.norm(place - anchors, axis=1)[:, None]
+    velocity_mps = rng.uniform(-1.0, 1.0, 3) * (1.0, 1.0, level_m is None)
+    rate_mps = away @ velocity_mps + case.rate_sd_mps * rng.standard_normal(len(anchors))
+    return replace(exact, range_m=range_m, range_rate_mps=rate_mps), place, least
 
 
 EXACT: dict[int, RangeEpoch] = {}
@@ -90,6 +104,15 @@ def astray(found: Fix, place: Floats) -> bool:
     return bool(beyond or (found.vpl_m is not None and away[2] > found.vpl_m))
 
 
+def mistaken(found: Fix, place: Floats) -> bool:
+    """Whether ranges were left out, and the rest taken for good, though they put the vehicle elsewhere."""
+    if found.status != "ok" or found.position_m is None or found.covariance is None or found.used.all():
+        return False
+    sd_m = np.sqrt(np.linalg.eigvalsh(found.covariance[:2, :2])[-1])
+    # so far apart another choice gainsays them, and that choice has noise of its own
+    return bool(np.hypot(*(found.position_m - place)[:2]) > 2 * APART_SIGMA * sd_m)
+
+
 @dataclass
 class Count:
     epochs: int = 0
@@ -97,6 +120,7 @@ class Count:
     excluded: int = 0
     bounded: int = 0
     misled: int = 0
+    mistaken: int = 0
     widest: float = 0.0
     levels: list[float] = field(default_factory=list)
 
@@ -109,6 +133,7 @@ def count_faulted(case: Case, epochs: int, rng: np.random.Generator) -> Count:
         out.alarms += found.status != "ok"
         out.excluded += found.status == "ok" and not found.used.all()
         out.misled += astray(found, place)
+        out.mistaken += mistaken(found, place)
         if found.status == "ok" and found.hpl_m is not None and found.position_m is not None:
             out.bounded += 1
             out.levels.append(found.hpl_m)
@@ -118,8 +143,11 @@ def count_faulted(case: Case, epochs: int, rng: np.random.Generator) -> Count:
 
 @pytest.mark.parametrize("name", CASES)
 def test_no_error_hides_beyond_its_protection_level(name: str, rng: np.random.Generator) -> None:
-    found = count_faulted(CASES[name], 300, rng)
+    epochs = 300
+    found = count_faulted(CASES[name], epochs, rng)
     assert found.misled == 0
+    # where beacons are few a descent may miss the place that gainsays: about one in a thousand
+    assert found.mistaken <= binom.ppf(1 - OUTSIDE, epochs, 2e-3)
     assert found.bounded > 50
 
 
@@ -179,16 +207,20 @@ def test_integrity_over_many_epochs(rng: np.random.Generator) -> None:
     print(f"\nFixes with one wrong range each, {epochs} epochs a row, in a hall of 10 m × 8 m; ranges good to 1 cm.")
     print("Seven biases in ten are about as large as is just noticed, the others are from 1 cm to 5 m.\n")
     print(
-        "| case | no error told of | left out | alarm | protection level, median | nearest error / level | beyond it |"
+        "| case | no error told of | left out | alarm | protection level, median | nearest error / level | beyond it "
+        "| wrong one left out |"
     )
-    print("|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|")
     misled = 0
     for name, case in CASES.items():
         found = count_faulted(case, epochs, rng)
         misled += found.misled
         quiet = epochs - found.alarms - found.excluded
         cells = [name, f"{quiet}", f"{found.excluded}", f"{found.alarms}", f"{np.median(found.levels):.2f} m"]
-        print("| " + " | ".join([*cells, f"{found.widest:.2f}", f"{found.misled}"]) + " |", flush=True)
+        print(
+            "| " + " | ".join([*cells, f"{found.widest:.2f}", f"{found.misled}", f"{found.mistaken}"]) + " |",
+            flush=True,
+        )
     assert misled == 0
 
 

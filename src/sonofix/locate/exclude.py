@@ -18,8 +18,8 @@ MOST_ANEW = 12
 """Choices that are solved from new starts where no descent from the faulty fix mends it."""
 
 APART_SIGMA = 6.0
-"""Two selections that both pass the test but put the vehicle this far apart leave the fault undecided."""
-
+"""Two selections that both pass the test but put the vehicle this far apart leave the fault undecided: so many
+deviations of the better one's position, along its widest axis."""
 
 MENDED = 1e-4
 """Rows that agree worse than this once a row is left out have hardly been mended: two wrong ones may look like one."""
@@ -41,12 +41,12 @@ def exclude(
     """
     if agrees(solver, len(rows), found[0].chi2) or len(rows) <= solver.needed + 1:
         return rows, found, True
-    tried: list[tuple[NDArray[np.int64], Floats, Floats, Floats]] = []
+    tried: list[tuple[NDArray[np.int64], Floats, Floats]] = []
     for count in (1, 2):
         if len(rows) - count <= solver.needed or (count == 2 and len(rows) * (len(rows) - 1) // 2 > MOST_PAIRS):
             break
         choices = _leaving(rows, count)
-        place_m, chi2, deviation_m = solver.without(choices, found[0])
+        place_m, chi2 = solver.without(choices, found[0])
         order = np.argsort(chi2, kind="stable")
         if not agrees(solver, len(rows) - count, float(chi2[order[0]])):
             # a descent from where the faulty row drew the fix may end in a wrong valley: begin anew without it
@@ -54,12 +54,12 @@ def exclude(
                 anew = solver.candidates(choices[i])
                 if anew and anew[0].chi2 < chi2[i]:
                     chi2[i], place_m[i] = anew[0].chi2, anew[0].position_m
-        tried.append((choices, place_m, chi2, deviation_m))
-        mended = _mended(solver, choices, place_m, chi2, deviation_m, MENDED)
+        tried.append((choices, place_m, chi2))
+        mended = _mended(solver, choices, place_m, chi2, MENDED)
         if mended is not None:
             return mended
-    for choices, place_m, chi2, deviation_m in tried:
-        mended = _mended(solver, choices, place_m, chi2, deviation_m, FALSE_ALARM)
+    for choices, place_m, chi2 in tried:
+        mended = _mended(solver, choices, place_m, chi2, FALSE_ALARM)
         if mended is not None:
             return mended
     return *_one_by_one(solver, rows, found), True
@@ -71,7 +71,7 @@ def agrees(solver: Rows, count: int, chi2: float) -> bool:
 
 
 def _mended(
-    solver: Rows, choices: NDArray[np.int64], place_m: Floats, chi2: Floats, deviation_m: Floats, rate: float
+    solver: Rows, choices: NDArray[np.int64], place_m: Floats, chi2: Floats, rate: float
 ) -> tuple[NDArray[np.int64], list[Solution], bool] | None:
     """Return the choice whose rows agree best, if they do at a false-alarm rate, and whether no rival gainsays it."""
     best, degrees = int(np.argmin(chi2)), solver.degrees(choices.shape[1])
@@ -81,7 +81,16 @@ def _mended(
     if not again:
         return None
     gap_m = np.linalg.norm(place_m[chi2 <= threshold(degrees)] - place_m[best], axis=1)
-    return choices[best], again, not np.any(gap_m > APART_SIGMA * deviation_m[best])
+    return choices[best], again, not np.any(gap_m > APART_SIGMA * _place_sd_m(solver, again[0]))
+
+
+def _place_sd_m(solver: Rows, found: Solution) -> float:
+    """Deviation of the position along its widest axis, all else being unknown too; 0 where a direction is open."""
+    covariance = solver.covariance(found)
+    if covariance is None:
+        return 0.0
+    places = 2 if solver.level_m is not None else 3
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:places, :places])[-1]))
 
 
 def _leaving(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
@@ -97,7 +106,7 @@ def _one_by_one(
 ) -> tuple[NDArray[np.int64], list[Solution]]:
     while len(rows) > solver.needed + 1 and not agrees(solver, len(rows), found[0].chi2):
         choices = _leaving(rows, 1)
-        chi2 = solver.without(choices, found[0])[1]
+        _, chi2 = solver.without(choices, found[0])
         best = int(np.argmin(chi2))
         again = solver.candidates(choices[best])
         before = found[0].chi2 / solver.degrees(len(rows))

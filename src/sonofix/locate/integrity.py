@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,9 @@ RISK = 1e-7
 
 GRID = 96
 """Noncentralities at which the risk is weighed; between two the worse of both ends is taken."""
+
+MOST_SETS = 5000
+"""Sets of rows that may be wrong together, looked at one by one: tens of milliseconds; with more no level is given."""
 
 
 @lru_cache(maxsize=256)
@@ -185,7 +189,8 @@ def protection_levels(
     Returns
     -------
     hpl_m, vpl_m : float, float or None
-        inf where a fault may go unnoticed at any size (too few rows); vpl_m None where ``vertical`` is.
+        inf where a fault may go unnoticed at any size (too few rows), or where there are more than `MOST_SETS` ways to
+        choose ``faults`` groups; vpl_m None where ``vertical`` is.
 
     Raises
     ------
@@ -232,7 +237,9 @@ def levels(
     if rank < count or not spread(white, deviation):
         return np.inf, None if vertical is None else np.inf
     sets = np.arange(len(white))[:, None] if groups is None else np.asarray(groups, np.int64)
-    if faults > 1:
+    if fault_probability and comb(len(sets), faults) > MOST_SETS:
+        return np.inf, None if vertical is None else np.inf
+    if fault_probability and faults > 1:
         chosen = np.array(list(combinations(range(len(sets)), faults)), np.int64).reshape(-1, faults)
         sets = sets[chosen].reshape(len(chosen), -1)
     # with a fault in every epoch there is no other kind to share the risk with

@@ -203,19 +203,18 @@ class Rows:
         ends = tuple(part[rows] for part in self._ends)
         return (ends, self._dt[rows], self._measured[both]), np.ascontiguousarray(self._covariance[both[:, None], both])
 
-    def without(self, choices: NDArray[np.int64], found: Solution) -> tuple[Floats, Floats, Floats]:
+    def without(self, choices: NDArray[np.int64], found: Solution) -> tuple[Floats, Floats]:
         """Solve again from a solution with each choice (q, p) of rows alone.
 
         Returns
         -------
-        position_m, chi2, deviation_m : float64 (q, 3), (q,), (q,)
-            The deviation is the largest of any unknown, the others taken as known.
+        position_m, chi2 : float64 (q, 3), (q,)
         """
-        states, chi2s, deviations = np.empty((len(choices), 10)), np.empty(len(choices)), np.empty(len(choices))
+        states, chi2s = np.empty((len(choices), 10)), np.empty(len(choices))
         rows = (self._ends, self._dt, self._measured)
         at = (self._speed_mps, self.clock, self._covariance, self._index)
-        without(rows, *at, choices, found.state, states, chi2s, deviations)
-        return states[:, :3], chi2s, deviations
+        without(rows, *at, choices, found.state, states, chi2s)
+        return states[:, :3], chi2s
 
     def look(self, kept: NDArray[np.int64], found: Solution) -> tuple[Floats, float | None, float | None]:
         """Residuals (n,) of all rows at a solution, and horizontal and vertical DOP of those kept."""

@@ -149,7 +149,7 @@ def _yaws(rows, c, clock, whiten, place, out):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def without(rows, c, clock, covariance, index, choices, begin_at, states, chi2s, deviations):
+def without(rows, c, clock, covariance, index, choices, begin_at, states, chi2s):
     """Solve again with only some rows, from one state, for each of many choices.
 
     Parameters
@@ -158,8 +158,6 @@ def without(rows, c, clock, covariance, index, choices, begin_at, states, chi2s,
         Rows to keep, each time.
     begin_at : float64 (10,)
     states, chi2s : float64 (q, 10) and (q,), out
-    deviations : float64 (q,), out
-        The largest of any unknown, the others taken as known.
     """
     count, m = choices.shape[1], len(rows[2]) // len(rows[1]) * choices.shape[1]
     part, whiten = np.empty((m, m)), np.empty((m, m))
@@ -171,12 +169,6 @@ def without(rows, c, clock, covariance, index, choices, begin_at, states, chi2s,
         for j in range(10):
             states[q, j] = begin_at[j]
         chi2s[q], _ = descend(kept, c, clock, whiten, index, known, STEPS, states[q], plain, miss, jacobian)
-        deviations[q] = 0.0
-        for j in range(len(index)):
-            size = 0.0
-            for i in range(m):
-                size += jacobian[i, j] ** 2
-            deviations[q] = max(deviations[q], 1.0 / max(np.sqrt(size), 1e-9))
 
 
 @numba.njit(cache=True, error_model="numpy")

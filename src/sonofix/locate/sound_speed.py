@@ -96,8 +96,8 @@ class SoundSpeed:
             aged_sd_mps = float(np.hypot(self._belief.sd_mps, WANDER_MPS * np.sqrt(aged_s / WANDER_S)))
             return self._belief.speed_mps, min(aged_sd_mps, sd_mps)
         found = _best(solve(with_sound_speed(epoch, epoch.sound_speed_mps, DOUBTED * sd_mps)))
-        # the speed comes from this very epoch, so that its deviation must not count as known beforehand
-        return (found[0], sd_mps) if found is not None and found[1] < LEARNT * sd_mps else None
+        # the speed comes from this very epoch: what is believed of it beforehand stays as wide as before it spoke
+        return (found[0], DOUBTED * sd_mps) if found is not None and found[1] < LEARNT * sd_mps else None
 
     def _tell(self, epoch: RangeEpoch) -> tuple[Event, ...]:
         belief = self._belief

@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from sonofix.geometry import POSE, link, model
+from sonofix.geometry import POSE, link, model, row_times
 from sonofix.locate.fix import fix
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.site import Site
@@ -19,10 +19,10 @@ from sonofix.site import Site
 AGREES_M = 0.3
 """Furthest a range may be from a position's to count for it: what a fix of few poor ranges can be off by."""
 
-MOST_TRIED = 2000
+MOST_TRIED = 400
 """Combinations of the strongest bursts' owners."""
 
-Alternatives = Callable[[str], list[tuple[str, float]]]
+Alternatives = Callable[[str, str], list[tuple[str, float]]]
 
 
 def tell_whose(epoch: RangeEpoch, site: Site, alternatives: Alternatives) -> tuple[RangeEpoch, str]:
@@ -31,9 +31,9 @@ def tell_whose(epoch: RangeEpoch, site: Site, alternatives: Alternatives) -> tup
     Parameters
     ----------
     epoch : RangeEpoch
-        With known clock; each row named after the first beacon of its code.
+        With known clock; rows of fixed beacons (or fixed microphones) and vehicles are decided upon, others pass.
     alternatives : callable
-        From an emitter's id to (beacon id, seconds of flight more than the row states) of all it may be.
+        From a row's emitter and receiver to (beacon id, seconds of flight more than the row states) of all it may be.
 
     Returns
     -------
@@ -45,9 +45,10 @@ def tell_whose(epoch: RangeEpoch, site: Site, alternatives: Alternatives) -> tup
     may_be = [_possible(epoch, row, alternatives) for row in range(len(epoch))]
     if all(len(options) <= 1 for options in may_be):
         return _as(epoch, [(row, *options[0]) for row, options in enumerate(may_be) if options]), ""
-    chosen: list[tuple[int, str, float]] = []
+    riders = [_rider(epoch, site, row) for row in range(len(epoch))]
+    chosen = [(i, epoch.emitter[i], float(epoch.range_m[i])) for i, rider in enumerate(riders) if rider is None]
     for vehicle in site.vehicles:
-        own = [i for i in range(len(epoch)) if site.microphone(epoch.receiver[i]).vehicle == vehicle.id]
+        own = [i for i, rider in enumerate(riders) if rider == vehicle.id]
         chosen += _of_vehicle(epoch, site, vehicle.id, own, may_be)
     chosen.sort()
     if not chosen:
@@ -55,10 +56,18 @@ def tell_whose(epoch: RangeEpoch, site: Site, alternatives: Alternatives) -> tup
     return _as(epoch, chosen), f"whose bursts they are was told by geometry: {len(chosen)} of {len(epoch)} make sense"
 
 
+def _rider(epoch: RangeEpoch, site: Site, row: int) -> str | None:
+    """Vehicle that one end of a row rides on while the other stands still; None where both ride, or neither."""
+    sent, heard = site.beacon(epoch.emitter[row]).vehicle, site.microphone(epoch.receiver[row]).vehicle
+    return sent or heard if (sent is None) != (heard is None) else None
+
+
 def _possible(epoch: RangeEpoch, row: int, alternatives: Alternatives) -> list[tuple[str, float]]:
     """Beacons and ranges that a row may be: none shorter than nothing."""
     c, stated_m = epoch.sound_speed_mps, float(epoch.range_m[row])
-    options = [(emitter, stated_m + c * more_s) for emitter, more_s in alternatives(epoch.emitter[row])]
+    options = [
+        (emitter, stated_m + c * more_s) for emitter, more_s in alternatives(epoch.emitter[row], epoch.receiver[row])
+    ]
     return [(emitter, range_m) for emitter, range_m in options if range_m > -AGREES_M]
 
 
@@ -91,7 +100,7 @@ def _of_vehicle(
         whole = fix(_as(epoch, sorted(sense)), site, vehicle)
         if whole.status == "ok":
             # of beacons that share a code the nearest is heard first and loudest
-            nearest = sum(_is_nearest(site, whole, emitter, [e for e, _ in may_be[i]]) for i, emitter, _ in sense)
+            nearest = sum(_is_nearest(site, whole, emitter, {e for e, _ in may_be[i]}) for i, emitter, _ in sense)
             left_m = float(np.sqrt(np.nanmean(whole.residual_m**2)))
             found.append((int(np.sum(whole.used)) + nearest, left_m, whole, sense))
     if not found:
@@ -104,12 +113,20 @@ def _of_vehicle(
     return sense
 
 
+def _arm_m(site: Site, epoch: RangeEpoch, row: int) -> float:
+    beacon, microphone = site.beacon(epoch.emitter[row]), site.microphone(epoch.receiver[row])
+    return float(np.hypot(*(beacon if beacon.vehicle else microphone).lever_arm_m[:2]))
+
+
 def _place(at: Fix) -> Floats:
     assert at.position_m is not None
     return at.position_m
 
 
-def _is_nearest(site: Site, at: Fix, emitter: str, rivals: list[str]) -> bool:
+def _is_nearest(site: Site, at: Fix, emitter: str, rivals: set[str]) -> bool:
+    if len(rivals) == 1:
+        return True
+
     def away_m(e: str) -> float:
         return float(np.linalg.norm(np.array(site.beacon(e).position_m) - _place(at)))
 
@@ -125,16 +142,19 @@ def _sense(
     pose[who, :3], pose[who, 3] = _place(at), at.yaw_rad or 0.0
     if at.velocity_mps is not None:
         pose[who, 4:7] = at.velocity_mps
+    # where the heading is open, an end off the axis may be anywhere round it
+    arm_m = {i: 2 * _arm_m(site, epoch, i) for i in own}
     out: list[tuple[int, str, float]] = []
     for i in own:
         if not may_be[i]:
             continue
         links = link(site, tuple(emitter for emitter, _ in may_be[i]), (epoch.receiver[i],) * len(may_be[i]))
-        dt = np.full(len(links), epoch.time_s[i] - at.time_s)
+        range_m = np.array([m for _, m in may_be[i]])
+        dt = row_times(links, np.full(len(links), epoch.time_s[i]), range_m, epoch.sound_speed_mps) - at.time_s
         predicted_m = model(links, pose, dt, epoch.sound_speed_mps)[0]
         off = [abs(range_m - p) for (_, range_m), p in zip(may_be[i], predicted_m, strict=True)]
         k = int(np.argmin(off))
-        if off[k] < AGREES_M:
+        if off[k] < AGREES_M + (arm_m[i] if at.yaw_rad is None else 0.0):
             out.append((i, *may_be[i][k]))
     return out
 
