@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sonofix.channel import Line, simulate
-from sonofix.flow import run
-from sonofix.records import Step, Truth
+from sonofix.flow import Receiver, run
+from sonofix.records import Recording, Step, Truth
 from sonofix.signals import codes
 from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
@@ -52,19 +52,15 @@ def zones(count: int) -> Site:
     return hall(beacons, (ZONE_M * count, 5.0, 3.2), 0.5, 6)
 
 
-def driven(site: Site, motion: Line, seconds: float, absorption: float) -> tuple[list[Step], Truth]:
-    recording, truth = simulate(
-        site,
-        {"v": motion},
-        rate_hz=48e3,
-        duration_s=seconds,
-        waveforms=waveforms_of(site),
-        level=0.3,
-        noise_sd=1e-3,
-        absorption_db_per_m=absorption,
-        seed=3,
-    )
-    return list(run(recording)), truth["v"]
+def recorded(site: Site, motion: Line, seconds: float, **how: Any) -> tuple[Recording, Truth]:
+    how = {"level": 0.3, "noise_sd": 1e-3, "absorption_db_per_m": 1.3, "seed": 3, "waveforms": waveforms_of(site)} | how
+    recording, truth = simulate(site, {"v": motion}, rate_hz=48e3, duration_s=seconds, **how)
+    return recording, truth["v"]
+
+
+def driven(site: Site, motion: Line, seconds: float, **how: Any) -> tuple[list[Step], Truth]:
+    recording, truth = recorded(site, motion, seconds, **how)
+    return list(run(recording)), truth
 
 
 def errors_m(steps: list[Step], truth: Truth) -> np.ndarray:
@@ -76,7 +72,7 @@ def errors_m(steps: list[Step], truth: Truth) -> np.ndarray:
 def test_a_vehicle_walks_from_zone_to_zone() -> None:
     """From the first zone to the third, which sends the first one's codes."""
     site = zones(3)
-    steps, truth = driven(site, Line((7.0, 2.2, 0.4), (2.0, 0.05, 0.0)), 10.5, 1.3)
+    steps, truth = driven(site, Line((7.0, 2.2, 0.4), (2.0, 0.05, 0.0)), 10.5)
     error = errors_m(steps, truth)
     assert len(error) >= len(steps) - 1
     assert np.sqrt(np.mean(error**2)) < 2e-3
@@ -90,27 +86,68 @@ def test_where_zones_repeat_all_round_nothing_is_claimed() -> None:
     """Heard from the middle of a zone alone, its codes say nothing of which zone it is: no position is better."""
     site = zones(4)
     only = {b.id for b in site.beacons if b.zone == "A"}
-    recording, _ = simulate(
-        site,
-        {"v": Line((6.0, 2.2, 0.4), (0.1, 0.0, 0.0))},
-        rate_hz=48e3,
-        duration_s=1.2,
-        waveforms={k: w for k, w in waveforms_of(site).items() if k in only},
-        level=0.3,
-        noise_sd=1e-3,
-        seed=3,
-    )
+    only = {k: w for k, w in waveforms_of(site).items() if k in only}
+    recording, _ = recorded(site, Line((6.0, 2.2, 0.4), (0.1, 0.0, 0.0)), 1.2, waveforms=only)
     steps = list(run(recording))
     assert steps
     assert not any(step.estimates for step in steps)
     assert any("cannot be told" in event.detail for event in steps[0].events)
 
 
+def test_a_vehicle_carried_to_another_zone_is_not_believed_in_the_first() -> None:
+    """Both send the same codes: what comes there as nothing was expected may be of either."""
+    site = zones(3)
+    parts = [recorded(site, Line((x, 2.2, 0.4), (0.3, 0.0, 0.0)), 2.0)[0] for x in (4.0, 28.0)]
+    receiver = Receiver(site, 48e3, waveforms_of(site))
+    steps: list[Step] = []
+    for part in parts:
+        assert part.blocks is not None
+        steps += [step for block in part.blocks(10**9) for step in receiver.feed(block)]
+    steps += receiver.finish()
+    carried = [step for step in steps if step.ranges.sync_s >= 2.5]
+    assert len(carried) >= 3
+    for step in carried:
+        for estimate in step.estimates:
+            assert abs(estimate.position_m[0] - 28.0) < 2.0 or estimate.source == "predicted"
+    assert carried[-1].estimates[0].source == "fused"
+
+
+def test_a_second_microphone_that_falls_silent_takes_nothing_with_it() -> None:
+    site = zones(3)
+    raw = site.model_dump(by_alias=True, exclude_none=True, mode="json")
+    raw["microphone"].append({"id": "N", "channel": 1, "vehicle": "v", "lever_arm_m": [0.3, 0.0, 0.0]})
+    two = Site.model_validate(raw)
+    recording, truth = recorded(two, Line((27.0, 2.2, 0.4), (0.3, 0.0, 0.0)), 2.5)
+    assert recording.blocks is not None
+    samples = np.concatenate(list(recording.blocks(10**9)))
+    samples[48_000:, 1] = 0.0
+    receiver = Receiver(two, 48e3, waveforms_of(two))
+    steps = [*receiver.feed(samples), *receiver.finish()]
+    assert len(steps) >= 4
+    assert np.max(errors_m(steps, truth)) < 0.02
+
+
+def test_fixed_microphones_hear_a_beacon_that_drives_in_short_epochs() -> None:
+    places = [(0.0, 0.0, 3.0), (30.0, 0.5, 2.8), (30.0, 12.0, 3.1), (0.5, 12.0, 2.9)]
+    raw = hall([{"id": "B", "vehicle": "v", "code": code(5, 0)}], (30.0, 12.0, 4.0), 0.08, 5).model_dump(
+        by_alias=True, exclude_none=True, mode="json"
+    )
+    raw["microphone"] = [{"id": f"M{i}", "channel": i, "position_m": place} for i, place in enumerate(places)]
+    steps, truth = driven(
+        Site.model_validate(raw), Line((9.0, 5.0, 0.4), (0.8, 0.1, 0.0)), 0.9, absorption_db_per_m=0.3
+    )
+    error = errors_m(steps, truth)
+    assert len(error) >= len(steps) - 2
+    assert np.sqrt(np.mean(error**2)) < 0.02
+
+
 @pytest.mark.parametrize("start", [(3.0, 6.0, 0.4), (24.0, 4.0, 0.4)])
 def test_epochs_shorter_than_the_flight(start: tuple[float, float, float]) -> None:
     """Twenty a second across 30 m: a period is 17 m, and bursts of two or three periods sound at once."""
     beacons = [{"id": f"B{i}", "position_m": place, "code": code(5, i)} for i, place in enumerate(ROUND_HALL)]
-    steps, truth = driven(hall(beacons, (30.0, 12.0, 5.0), 0.05, 5), Line(start, (1.2, 0.1, 0.0)), 0.7, 0.3)
+    steps, truth = driven(
+        hall(beacons, (30.0, 12.0, 5.0), 0.05, 5), Line(start, (1.2, 0.1, 0.0)), 0.7, absorption_db_per_m=0.3
+    )
     error = errors_m(steps, truth)
     assert len(error) >= len(steps) - 2
     assert np.sqrt(np.mean(error**2)) < 5e-3

@@ -38,6 +38,7 @@ from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, estimate, predict
 from sonofix.track.follow import Follower, expectations
+from sonofix.track.inputs import gather
 
 DEFAULT_MAX_SPEED_MPS = 3.0
 """Of a vehicle whose site file states none."""
@@ -68,6 +69,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
         yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
     elif recording.ranges is not None:
         street = Street(recording.site, recording.tables.get("start"), rate_hz)
+        street.sense(recording.tables, stated=True)
         for epoch in stated_epochs(recording.ranges, recording.site):
             yield street.walk(epoch)
     else:
@@ -84,6 +86,7 @@ def _run_samples(
     site = recording.site
     waveforms = waveforms_of(site, recording.references)
     receiver = Receiver(site, sample_rate_hz, waveforms, recording.sync_s, recording.tables.get("start"), rate_hz)
+    receiver.sense(recording.tables)
     count, last = 0, None
 
     def steps() -> Iterator[Step]:
@@ -142,6 +145,7 @@ def explain(recording: Recording, epoch: int, microphone: str | None = None) -> 
         recording.tables.get("start"),
         on_hearing=lambda hearing: heard.__setitem__(hearing.receiver, hearing),
     )
+    receiver.sense(recording.tables)
     fed = chain.from_iterable(receiver.feed(block) for block in recording.blocks(int(recording.rate_hz)))
     count = 0
     for step in chain(fed, receiver.finish()):
@@ -150,6 +154,8 @@ def explain(recording: Recording, epoch: int, microphone: str | None = None) -> 
             seen = insight(heard[microphone or listening[0]], epoch, ranges.sync_s, ranges.clock)
             own = [i for i, r in enumerate(ranges.receiver) if r == seen.microphone]
             used = {ranges.emitter[i]: bool(step.range_used[i]) for i in own}
+            # what nothing predicted was listened for as the first beacon of its code
+            used = {receiver.heard_as(name): was for name, was in used.items()} | used
             return replace(seen, used=used, events=step.events)
         count += 1
     there = f"epochs 0 to {count - 1}" if count else "no whole epoch"
@@ -166,6 +172,14 @@ class Street:
         self.air = SoundSpeed()
         self._start = start
         self._written_s: float | None = None
+
+    def sense(self, tables: Mapping[str, Table], stated: bool = False) -> None:
+        """Let what vehicles' own sensors tell of their motion enter, each row at its time; before the first epoch.
+
+        ``stated``: the ranges come from others, with errors of their own.
+        """
+        inputs = gather(self.site, tables, stated)
+        self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs)
 
     def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
         """Take in the ranges of one epoch."""
@@ -263,7 +277,7 @@ class Receiver:
         speeds = [v.max_speed_mps or DEFAULT_MAX_SPEED_MPS for v in site.vehicles] or [0.0]
         sounding = any(b.vehicle for b in site.coded_beacons) and any(m.vehicle for m in self._microphones)
         reach = reach_s(site, self.sound_speed_mps)
-        self._roll = Roll(site, waveforms, reach)
+        self._roll = Roll(site, waveforms, self.sound_speed_mps)
         self._plan = make_plan(
             self._roll.named(), sample_rate_hz, self.sound_speed_mps, max(speeds) * (2.0 if sounding else 1.0)
         )
@@ -273,14 +287,23 @@ class Receiver:
         self._offsets_s = {b.id: b.offset_s + b.delay_s for b in site.coded_beacons}
         lags = [m.delay_s for m in self._microphones]
         self._earliest_s = min(self._offsets_s.values()) + min(lags)
-        if self._roll.short:
-            # bursts that began before an epoch sound on within it
-            self._earliest_s -= self._plan.burst_s
         self._latest_s = max(self._offsets_s.values()) + max(lags)
+        if self._roll.short:
+            # bursts that began before an epoch sound on within it, and those after it begin in it
+            self._earliest_s -= self._plan.burst_s
+            self._latest_s += self._plan.burst_s
         self._samples = np.zeros((0, 0), np.float32)
         self._first = 0  # index of _samples[0] in the stream; below 0 for the silence before it
         self._heard_last = 0
         self._agility_mps2 = 1.0
+
+    def sense(self, tables: Mapping[str, Table]) -> None:
+        """Take in what vehicles' own sensors told, as `Street.sense` does."""
+        self._street.sense(tables)
+
+    def heard_as(self, emitter: str) -> str:
+        """Beacon that an emitter is listened for as where nothing is predicted: the first of its code."""
+        return self._roll.head(emitter)
 
     def feed(self, block: NDArray[np.float32]) -> Iterator[Step]:
         """Take in samples (n, channels), full scale ±1, and yield what they complete."""
@@ -339,13 +362,13 @@ class Receiver:
 
     def _hear(
         self, window: Window, samples: NDArray[np.float32], first: int
-    ) -> tuple[tuple[Detection, ...], tuple[str, ...], bool]:
+    ) -> tuple[tuple[Detection, ...], tuple[str, ...], dict[str, tuple[Detection, ...]]]:
         """Acquire every microphone's bursts: warm where a track says what to expect, cold where that fails.
 
-        Says too whether any was searched cold, so that whose its bursts are is to be told.
+        Says too which were searched cold, so that whose bursts those are is to be told, and what had come as expected.
         """
         flags: list[str] = []
-        untold = False
+        untold: dict[str, tuple[Detection, ...]] = {}
         heard: list[Detection] = []
         for microphone in self._microphones:
             channel, odd = screen(samples[:, microphone.channel], self._plan.sample_rate_hz)
@@ -353,11 +376,11 @@ class Receiver:
             emitters = self._roll.listens(microphone.vehicle)
             expected = {} if window.seeking else self._expect(window, microphone.id, emitters)
             call = self._roll.call(window, microphone.delay_s, emitters, expected)
-            found, notes = acquire(self._plan, channel, first, microphone.id, call.windows, call.predictions)
+            sure = not self._roll.ambiguous  # else what comes as none expects may be any of several
+            found, notes = acquire(self._plan, channel, first, microphone.id, call.windows, call.predictions, sure)
             own = tuple(self._roll.heard(found, call))
-            # where only the track tells whose bursts are whose, it is given up for none at all alone
-            few = 1 if self._roll.ambiguous else 0.7 * self._heard_last / len(self._microphones)
-            repeated = bool(expected) and len(own) < few
+            expectedly = own
+            repeated = bool(expected) and len(own) < 0.7 * self._heard_last / len(self._microphones)
             if repeated:
                 call = self._roll.call(window, microphone.delay_s, emitters, {})
                 found, notes = acquire(self._plan, channel, first, microphone.id, call.windows)
@@ -367,23 +390,41 @@ class Receiver:
                 given = (microphone.id, channel, first, call.windows, call.predictions)
                 sent_s = self._roll.sent_s(window, microphone.delay_s, call)
                 self._on_hearing(Hearing(self._plan, *given, sent_s, odd, "" if call.predictions else why))
-            untold |= not call.predictions
+            if not call.predictions and self._roll.ambiguous:
+                untold[microphone.id] = expectedly if repeated else ()
             heard += own
             flags += [f"microphone {microphone.id}: {text}" for text in notes]
         self._heard_last = len(heard)
-        return tuple(heard), tuple(flags), untold and self._roll.ambiguous
+        return tuple(heard), tuple(flags), untold
 
-    def _step(self, window: Window, heard: tuple[Detection, ...], flags: tuple[str, ...], untold: bool) -> Step:
-        acquired = Acquisition(window.index, window.sync_s, heard, flags)
-        ranges = range_epoch(self.site, self.waveforms, acquired, self.sound_speed_mps, self.sound_speed_sd_mps)
+    def _step(
+        self,
+        window: Window,
+        heard: tuple[Detection, ...],
+        flags: tuple[str, ...],
+        untold: Mapping[str, tuple[Detection, ...]],
+    ) -> Step:
+        ranges = self._ranges(window, heard, flags)
         events = tuple(Event(window.sync_s, "", "samples", text) for text in flags)
         if untold and len(ranges):
-            ranges, told = tell_whose(ranges, self.site, self._roll.whose)
+
+            def alternatives(emitter: str, receiver: str) -> list[tuple[str, float]]:
+                return self._roll.whose(emitter, window) if receiver in untold else [(emitter, 0.0)]
+
+            ranges, told = tell_whose(ranges, self.site, alternatives)
             events += (Event(window.sync_s, "", "whose", told),) if told else ()
+            if not len(ranges):
+                # then what came as expected is all there is to go by
+                left = [d for d in heard if d.receiver not in untold]
+                ranges = self._ranges(window, (*left, *chain.from_iterable(untold.values())), flags)
         before = self._street.follower.belief
         step = self._street.walk(ranges, events)
         self._watch(before, self._street.follower.belief)
         return step
+
+    def _ranges(self, window: Window, heard: tuple[Detection, ...], flags: tuple[str, ...]) -> RangeEpoch:
+        acquired = Acquisition(window.index, window.sync_s, heard, flags)
+        return range_epoch(self.site, self.waveforms, acquired, self.sound_speed_mps, self.sound_speed_sd_mps)
 
     def _watch(self, before: Belief, after: Belief) -> None:
         """Learn how briskly vehicles change speed: what the next warm search must allow for."""

@@ -37,9 +37,7 @@ def range_epoch(
     delay_s = np.array([site.microphone(d.receiver).delay_s for d in heard])
     time_s = np.array([d.arrival_s for d in heard]) - delay_s
     sent_s = acquired.sync_s + np.array([b.offset_s + b.delay_s + waveforms[b.id].duration_s / 2 for b in beacons])
-    if any(d.periods_ago for d in heard):
-        assert site.schedule is not None
-        sent_s -= float(site.schedule.period_s or 0.0) * np.array([d.periods_ago for d in heard])
+    sent_s -= np.array([d.sent_before_s for d in heard])
     range_m = sound_speed_mps * (time_s - sent_s)
     own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2
     rate = sound_speed_mps * (1.0 - np.array([d.time_scale for d in heard]))

@@ -163,8 +163,8 @@ class Detection:
     snr_db : float
         Mean burst power over the noise power in the search band.
     paths : tuple of Path
-    periods_ago : int
-        In which period before the epoch's it was sent: above 0 where epochs are shorter than the flight.
+    sent_before_s : float
+        By how much its epoch began before the one it was heard in: above 0 where epochs are shorter than the flight.
     """
 
     emitter: str
@@ -175,7 +175,7 @@ class Detection:
     amplitude: float
     snr_db: float
     paths: tuple[Path, ...] = ()
-    periods_ago: int = 0
+    sent_before_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

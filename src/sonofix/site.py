@@ -468,9 +468,12 @@ def _code_rules(beacons: list[Callable[[str], Any]], schedule: object, signal: o
         if isinstance(offset, int | float) and isinstance(period, int | float) and 0 < period <= abs(offset):
             yield ("beacon", i, "offset_s"), offset, f"bursts start within their period of {period} s"
     for (i, a), (k, b) in combinations(coded, 2):
-        if _in_two_zones(a, b):
-            continue
-        if (_code_key(a("code")), repr(a("carrier_hz"))) == (_code_key(b("code")), repr(b("carrier_hz"))):
+        alike = (_code_key(a("code")), repr(a("carrier_hz"))) == (_code_key(b("code")), repr(b("carrier_hz")))
+        if alike and _in_two_zones(a, b):
+            if _reader(schedule)("synchronised") is False:
+                remedy = f"codes that zones share ({a('id')}, {b('id')}) need synchronised = true, or a code each"
+                yield ("schedule", "synchronised"), False, remedy
+        elif alike:
             remedy = f"beacon {i + 1} ({a('id')}) sends the same code; every beacon of a zone needs its own"
             yield ("beacon", k, "code"), b("id"), remedy
 

@@ -206,3 +206,22 @@ def test_samples_that_are_not_finite_are_refused() -> None:
     samples[7] = np.nan
     with pytest.raises(ValueError, match=r"1 of 4800 samples are not finite"):
         acquire(PLAN, samples, 0, "M", {"A": (0.0, 0.01)})
+
+
+@pytest.mark.parametrize("lost_s", [3e-3, 12e-3])
+def test_samples_that_were_never_recorded_count_for_nothing(lost_s: float, rng: np.random.Generator) -> None:
+    """A drop-out amid bursts that two others hide behind: what it took is no sound, and no phantom makes up for it."""
+    samples = heard(MIXED, 1e-3, rng)
+    first = int(0.066 * RATE_HZ)
+    samples[first : first + int(lost_s * RATE_HZ)] = 0.0
+    found = listen(samples)
+    assert set(found) == {"A", "B", "D"}
+    for name, arrival_s, rate, _ in MIXED:
+        assert agrees(found[name], arrival_s, rate)
+
+
+def test_where_nothing_comes_as_predicted_the_caller_decides_what_then(rng: np.random.Generator) -> None:
+    samples = heard([("A", 0.061, 0.0, 0.2 + 0j)], 1e-3, rng)
+    wrong = {"A": Prediction("A", "M", 0.1, 2e-4, 0.0, 0.05)}
+    assert agrees(listen(samples, predictions=wrong)["A"], 0.061, 0.0)
+    assert not listen(samples, predictions=wrong, everywhere=False)

@@ -138,7 +138,9 @@ def test_residual_is_what_bursts_leave(rng: np.random.Generator) -> None:
 def test_parts_matched_are_those_of_the_plain_model(parts: int, rng: np.random.Generator) -> None:
     heard = model(BURSTS[0]) + noisy(rng, 1e-2)
     burst = BURSTS[0]
-    seen, middle_s, energy = matched_parts(heard, *fixed(burst), burst.arrival_s, burst.beta + 2e-4, burst.kappa, parts)
+    seen, middle_s, energy = matched_parts(
+        heard, *fixed(burst), burst.arrival_s, burst.beta + 2e-4, burst.kappa, np.zeros(len(heard), bool), parts
+    )
     plain = model(replace(burst, beta=burst.beta + 2e-4, gain=1.0))
     out = np.zeros((4, 2, len(heard)), np.float32)
     sounding = np.arange(*columns(*fixed(burst), burst.arrival_s, burst.beta + 2e-4, burst.kappa, out))
@@ -181,6 +183,10 @@ def test_a_turn_within_a_burst_is_followed(rng: np.random.Generator) -> None:
     assert now - 1e-4 * len(straight) < 0.1 * (left - 1e-4 * len(straight))
     # the moment of the middle is told by the envelope: it stays
     assert joint.bursts[0].arrival_s == pytest.approx(burst.arrival_s, abs=1e-5)
+    # and the rate there is that before the kink, nearer than the whole burst's slope
+    found = joint.bursts[0]
+    assert abs(found.beta + found.swing - burst.beta) < 0.5 * abs(found.beta - burst.beta)
+    assert abs(found.beta + found.swing - burst.beta) < 2 * found.swing_sd
 
 
 def test_noise_gives_a_wobble_half_its_power_a_degree(rng: np.random.Generator) -> None:

@@ -28,7 +28,8 @@ START_GUARD_S = 5e-3
 class Window:
     """Bursts of one epoch begin to be heard within [opens_s, closes_s], their offsets and delays aside.
 
-    ``sync_s`` is what ranges are measured from; ``seeking`` marks the search for an unknown clock's phase.
+    ``sync_s`` is what ranges are measured from; ``seeking`` marks the search for an unknown clock's phase;
+    ``before_s`` are the sync commands of earlier epochs, where they were told, latest first.
     """
 
     index: int
@@ -36,6 +37,20 @@ class Window:
     opens_s: float
     closes_s: float
     seeking: bool = False
+    before_s: tuple[float, ...] = ()
+
+    def since_s(self, epochs: int, period_s: float) -> float:
+        """How long before this epoch another began, so many epochs earlier."""
+        if not epochs:
+            return 0.0
+        return self.sync_s - self.before_s[epochs - 1] if 0 < epochs <= len(self.before_s) else epochs * period_s
+
+
+def across_s(site: Site, sound_speed_mps: float) -> float:
+    """Longest flight there can be: the diagonal of all that is fixed, and of the room; infinite where nothing is."""
+    points = [n.position_m for n in (*site.beacons, *site.microphones) if n.position_m is not None]
+    points += list(site.bounds_m or ())
+    return float(np.linalg.norm(np.ptp(np.array(points), axis=0))) / sound_speed_mps if len(points) > 1 else np.inf
 
 
 def reach_s(site: Site, sound_speed_mps: float) -> float:
@@ -88,7 +103,8 @@ class Schedule:
                 sync_s = float(self._sync_s[self._index])
             else:
                 return None
-            return Window(self._index, sync_s, sync_s, sync_s + self._reach_s)
+            before_s = () if self._sync_s is None else tuple(self._sync_s[max(0, self._index - 8) : self._index][::-1])
+            return Window(self._index, sync_s, sync_s, sync_s + self._reach_s, before_s=before_s)
         if self._first_s is None:
             return Window(self._index, self._seek_s, self._seek_s, self._seek_s + self._period_s, seeking=True)
         opens_s, closes_s = self._first_s - self._reach_s, self._first_s + self._reach_s
@@ -135,10 +151,15 @@ def screen(samples: NDArray[np.float32], rate_hz: float) -> tuple[NDArray[np.flo
     if loudest == 0.0:
         flags.append("no sound at all: every sample is 0")
     else:
-        edges = runs(samples == 0.0)
-        lengths = np.diff(edges, axis=1)[:, 0][(edges[:, 0] > 0) & (edges[:, 1] < samples.size)]
-        missing = lengths[lengths > DROP_OUT_S * rate_hz]
+        missing = missing_runs(samples, rate_hz)
         if len(missing):
-            lost_ms = 1e3 * float(np.sum(missing)) / rate_hz
+            lost_ms = 1e3 * float(np.sum(np.diff(missing, axis=1))) / rate_hz
             flags.append(f"{len(missing)} drop-outs, {lost_ms:.0f} ms in all, in which every sample is 0")
     return samples, tuple(flags)
+
+
+def missing_runs(samples: NDArray[np.float32], rate_hz: float) -> NDArray[np.int64]:
+    """Runs (k, 2), first and past-the-last sample, that stay exactly 0 for too long to be sound, amid samples."""
+    edges = runs(samples == 0.0)
+    amid = (edges[:, 0] > 0) & (edges[:, 1] < samples.size)
+    return edges[amid & (np.diff(edges, axis=1)[:, 0] > DROP_OUT_S * rate_hz)]

@@ -135,11 +135,13 @@ def matched_parts(
     arrival_s: float,
     beta: float,
     kappa: float,
+    left_out: NDArray[np.bool_],
     parts: int,
 ) -> tuple[NDArray[np.complex128], Floats, Floats]:
     """Inner products (parts,) of a burst's model of unit gain with ``heard`` (n,), part by part of its length.
 
-    Also the middle of each part, from the arrival, and the model's energy in it (parts,).
+    Also the middle of each part, from the arrival, and the model's energy in it (parts,). What is left out counts as
+    neither.
     """
     first, last = _sounding(
         table.shape[0], table_rate_hz, table_start_s, half_s, start_s, rate_hz, heard.shape[0], arrival_s, beta, kappa
@@ -157,8 +159,9 @@ def matched_parts(
             ahead = _turned(carrier_hz, beta, kappa, u + step_s) * np.conj(carrier)
         tau = half_s + u - beta * u - 0.5 * kappa * u * u
         model = read(table, (tau - table_start_s) * table_rate_hz) * carrier
-        seen[(n - first) // size] += np.conj(model) * heard[n]
-        energy[(n - first) // size] += model.real**2 + model.imag**2
+        if not left_out[n]:
+            seen[(n - first) // size] += np.conj(model) * heard[n]
+            energy[(n - first) // size] += model.real**2 + model.imag**2
         carrier *= ahead
         ahead *= bend
     for p in range(parts):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.bank import Bank, make_bank
 from sonofix.acquire.baseband import Band, band_limited, design_band, downconvert
+from sonofix.acquire.epochs import missing_runs
 from sonofix.acquire.separate import Separation, Watch
 from sonofix.acquire.tones import MARGIN_S, find_tones, level_db
 from sonofix.records import Detection, Prediction, Waveform
@@ -96,6 +97,7 @@ def acquire(
     receiver: str,
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction] | None = None,
+    everywhere: bool = True,
 ) -> tuple[tuple[Detection, ...], tuple[str, ...]]:
     """All bursts that one microphone heard in one epoch.
 
@@ -109,6 +111,8 @@ def acquire(
         When its burst may begin to be heard, recorder's clock. Emitters not named are not searched.
     predictions : mapping from emitter id to Prediction
         Warm search: delay and range rate only within five deviations of what is expected.
+    everywhere : bool
+        Whether to search everywhere where nothing comes as predicted.
 
     Returns
     -------
@@ -126,7 +130,7 @@ def acquire(
         raise ValueError(f"{bad} of {samples.size} samples are not finite; pass them through epochs.screen first")
     notes: list[str] = []
     found: list[Detection] = []
-    for job in taken_apart(plan, samples, first_sample, windows, predictions):
+    for job in taken_apart(plan, samples, first_sample, windows, predictions, everywhere=everywhere):
         notes += job.notes
         found += job.detections(receiver)
     found.sort(key=lambda detection: -detection.amplitude)
@@ -140,6 +144,7 @@ def taken_apart(
     windows: Mapping[str, tuple[float, float]],
     predictions: Mapping[str, Prediction] | None = None,
     watch: Watch | None = None,
+    everywhere: bool = True,
 ) -> Iterator[Separation]:
     """Do the work of `acquire` and yield it, band by band; ``watch`` is told each step of it."""
     for band, banks in plan.bands:
@@ -147,6 +152,10 @@ def taken_apart(
         if not len(baseband):
             continue
         tones = find_tones(baseband, band.rate_hz)
+        missing = np.zeros(len(baseband), bool)
+        for begin, end in missing_runs(samples, plan.sample_rate_hz):
+            # an output of the filter rests on as many samples as it has taps
+            missing[max(0, (begin - len(band.taps)) // band.decimation + 1) : end // band.decimation + 1] = True
         job = Separation(
             band,
             [b for b in banks if b.emitter in windows],
@@ -158,10 +167,11 @@ def taken_apart(
             kappa_sd=plan.kappa_sd,
             false_alarm_rate=plan.false_alarm_rate,
             watch=watch,
+            missing=missing,
         )
         left = baseband - sum(tone.course for tone in tones)
         for tone in tones:
             text = f"a tone at {(band.carrier_hz + tone.offset_hz) / 1e3:.3f} kHz"
             job.notes.append(f"{text}, {level_db(tone, left):.0f} dB over all else in the band, was taken out")
-        job.run(predictions or {})
+        job.run(predictions or {}, everywhere)
         yield job

@@ -61,13 +61,19 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Burst:
-    """One burst in the base band: ``arrival_s`` of its middle, β, κ (1/s) and complex gain."""
+    """One burst in the base band: ``arrival_s`` of its middle, β, κ (1/s) and complex gain.
+
+    ``swing`` is what β at the middle is more than β, the slope there of a wobble that the waveform was turned by;
+    ``swing_sd`` how surely: half of what that slope is all along, root mean square.
+    """
 
     waveform: Waveform
     arrival_s: float
     beta: float
     kappa: float
     gain: complex
+    swing: float = 0.0
+    swing_sd: float = 0.0
 
     @property
     def state(self) -> Floats:
@@ -171,7 +177,7 @@ class Joint:
             # half a chip and a tenth of a metre a second bound what the linearisation can be trusted for
             move = np.clip(step[:, 2:], -STEP_LIMIT, STEP_LIMIT)
             moved = [
-                Burst(b.waveform, row[0], row[1], row[2], complex(g))
+                Burst(b.waveform, row[0], row[1], row[2], complex(g), b.swing, b.swing_sd)
                 for b, row, g in zip(
                     self.bursts, (state + move).tolist(), gain + step[:, 0] + 1j * step[:, 1], strict=True
                 )
@@ -213,7 +219,7 @@ class Joint:
         betas = burst.beta + np.linspace(-reach, reach, 2 * int(np.ceil(reach * by_beta / BEND_STEP_RAD)) + 1)
         heard, fixed = self.residual_with(i), self._fixed(burst.waveform, burst.waveform.envelope)
         # what another line or parabola turns is turned part by part; the code's own stretch by it is small
-        seen, u_s, _ = matched_parts(heard, *fixed, burst.arrival_s, burst.beta, burst.kappa, PARTS)
+        seen, u_s, _ = matched_parts(heard, *fixed, burst.arrival_s, burst.beta, burst.kappa, self._left_out, PARTS)
         turn = 2j * np.pi * burst.waveform.carrier_hz
         bends = np.exp(turn / 2 * np.outer(kappas - burst.kappa, u_s**2))
         power = np.abs(bends * seen @ np.exp(turn * np.outer(u_s, betas - burst.beta))) ** 2
@@ -241,7 +247,7 @@ class Joint:
         burst = self.bursts[i]
         fixed = self._fixed(burst.waveform, burst.waveform.envelope)
         state = burst.arrival_s, burst.beta, burst.kappa
-        seen, u_s, energy = matched_parts(self.residual_with(i), *fixed, *state, PARTS)
+        seen, u_s, energy = matched_parts(self.residual_with(i), *fixed, *state, self._left_out, PARTS)
         basis = legendre.legvander(2 * u_s / burst.waveform.duration_s, 2 + WOBBLES)
         weight = np.sqrt(energy / np.sum(energy))[:, None]
         before, phase = float(abs(np.sum(seen)) ** 2), np.zeros(WOBBLES)
@@ -264,7 +270,13 @@ class Joint:
         turn = np.exp(1j * legendre.legval(inside, np.concatenate([np.zeros(3), wobble])))
         signature = w.signature * turn
         envelope = signature if w.signature is w.envelope else w.envelope * turn
-        self.bursts[i] = replace(burst, waveform=replace(w, envelope=envelope, signature=signature))
+        slopes = legendre.legval(np.linspace(-1.0, 1.0, 65), legendre.legder(np.concatenate([np.zeros(3), wobble])))
+        slopes *= -2 / w.duration_s / (2 * np.pi * w.carrier_hz)
+        swing = burst.swing + float(slopes[32])
+        swing_sd = float(np.hypot(burst.swing_sd, 0.5 * np.sqrt(np.mean(slopes**2))))
+        self.bursts[i] = replace(
+            burst, waveform=replace(w, envelope=envelope, signature=signature), swing=swing, swing_sd=swing_sd
+        )
         self._renew(i)
         self.residual = self._left(self.bursts)
 
@@ -342,7 +354,8 @@ class Joint:
     def _explained(self, heard: Complexes, burst: Burst, table: Complexes) -> float:
         """Power that a burst, heard with one of its waveform's tables, explains of ``heard`` (n,), its gain free."""
         fixed = self._fixed(burst.waveform, table)
-        seen, _, energy = matched_parts(heard, *fixed, burst.arrival_s, burst.beta, burst.kappa, 1)
+        state = burst.arrival_s, burst.beta, burst.kappa
+        seen, _, energy = matched_parts(heard, *fixed, *state, self._left_out, 1)
         return float(abs(seen[0]) ** 2 / energy[0])
 
     def _fixed(self, w: Waveform, table: Complexes) -> tuple[Complexes, float, float, float, float, float, float]:

@@ -18,12 +18,14 @@ def mean_power(w: Waveform) -> float:
 
 
 def detection_of(
-    emitter: str, burst: Burst, own: list[Burst], covariance: Floats, noise: float, receiver: str
+    emitter: str, waveform: Waveform, burst: Burst, own: list[Burst], covariance: Floats, noise: float, receiver: str
 ) -> Detection:
     """Report an emitter by one path.
 
     Parameters
     ----------
+    waveform : Waveform
+        That the emitter sends.
     burst : Burst
         The path that is the range.
     own : list of Burst
@@ -35,7 +37,8 @@ def detection_of(
     receiver : str
         The microphone's id.
     """
-    power = abs(burst.gain) ** 2 * mean_power(burst.waveform)
+    power = abs(burst.gain) ** 2 * mean_power(waveform)
+    swung = np.diag([0.0, burst.swing_sd**2])
     paths = tuple(
         Path(
             b.arrival_s - burst.arrival_s,
@@ -47,9 +50,9 @@ def detection_of(
         emitter=emitter,
         receiver=receiver,
         arrival_s=burst.arrival_s,
-        time_scale=1.0 - burst.beta,
+        time_scale=1.0 - burst.beta - burst.swing,
         # β and the time scale differ in sign
-        covariance=covariance * np.array([[1.0, -1.0], [-1.0, 1.0]]),
+        covariance=covariance * np.array([[1.0, -1.0], [-1.0, 1.0]]) + swung,
         amplitude=abs(burst.gain),
         snr_db=float(10 * np.log10(max(power, 1e-30) / noise)),
         paths=paths,

@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sonofix.acquire.epochs import Window
+from sonofix.acquire.epochs import Window, across_s
 from sonofix.records import Detection, Prediction, Waveform
+from sonofix.signals.waveform import chips_of
 from sonofix.site import Site
 
 OUT_OF_REACH_M = 45.0
@@ -23,20 +24,20 @@ OUT_OF_REACH_M = 45.0
 APART_SD = 5.0
 """Deviations that two of one code must be expected apart, to be listened for at all."""
 
-EARLIER, LATER = " (earlier)", " (later)"
-"""Marks of bursts that begin before an epoch's window opens or after it closes, and sound within."""
+EARLIER, LATER = ", earlier", ", later"
+"""Marks of bursts that begin before an epoch's window opens or after it closes, and sound within. No id has a comma."""
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
     """What `acquire` is asked for: windows and predictions, by name in the plan.
 
-    ``periods_ago`` says of each predicted emitter in which period before the epoch's its burst was sent.
+    ``sent_before_s`` says of each predicted one by how much the epoch it was sent in began before this one.
     """
 
     windows: Mapping[str, tuple[float, float]]
     predictions: Mapping[str, Prediction]
-    periods_ago: Mapping[str, int]
+    sent_before_s: Mapping[str, float]
 
 
 class Roll:
@@ -45,25 +46,33 @@ class Roll:
     Parameters
     ----------
     waveforms : mapping from beacon id to Waveform
-    reach_s : float
-        Longest flight.
+    sound_speed_mps : float
+
+    Attributes
+    ----------
+    short : bool
+        Whether a flight across all there is may outlast a period.
+    sharing : mapping from beacon id to tuple of str
+        First beacon of each code, and all that send it, itself among them.
     """
 
-    def __init__(self, site: Site, waveforms: Mapping[str, Waveform], reach_s: float) -> None:
+    def __init__(self, site: Site, waveforms: Mapping[str, Waveform], sound_speed_mps: float) -> None:
         schedule = site.schedule
         self.period_s = schedule.period_s if schedule is not None and schedule.period_s is not None else np.inf
-        self.short = site.clock_known and reach_s > self.period_s
-        self.reach_s = reach_s
+        self._sound_speed_mps = sound_speed_mps
+        self._across_s = across_s(site, sound_speed_mps)
+        self.short = site.clock_known and np.isfinite(self._across_s) and self._across_s > self.period_s
         self._waveforms = waveforms
         coded = [b for b in site.coded_beacons if b.id in waveforms]
         self._offset_s = {b.id: b.offset_s + b.delay_s for b in coded}
         self._vehicle = {b.id: b.vehicle for b in coded}
         self.sharing: dict[str, tuple[str, ...]] = {}
-        """First beacon of each code, and all that send it, itself among them."""
         first: dict[tuple[object, ...], str] = {}
         for b in coded:
-            signal = site.signal_of(b)
-            head = first.setdefault((repr(b.code), signal.carrier_hz, signal.modulation), b.id)
+            chips = chips_of(b)
+            # the same chips may be written in several ways
+            code = repr(b.code) if chips is None else chips.tobytes()
+            head = first.setdefault((code, repr(site.signal_of(b))), b.id)
             self.sharing[head] = (*self.sharing.get(head, ()), b.id)
 
     @property
@@ -98,15 +107,16 @@ class Roll:
         }
         if not expected:
             heads = [e for e in emitters if e in self.sharing]
-            windows = {e: within[e] for e in heads}
+            mates = {e: [within[o] for o in self.sharing[e] if o in within] for e in heads}
+            windows = {e: (min(w[0] for w in mates[e]), max(w[1] for w in mates[e])) for e in heads}
             if self.short:
                 for e in heads:
                     length_s = self._waveforms[e].duration_s
-                    opens_s, closes_s = within[e]
+                    opens_s, closes_s = windows[e]
                     windows[e + EARLIER] = (opens_s - length_s, opens_s)
                     windows[e + LATER] = (closes_s, closes_s + length_s)
             return Call(windows, {}, {})
-        return self._call_expected(within, self._told_apart(window, expected))
+        return self._call_expected(window, within, self._told_apart(window, expected))
 
     def _told_apart(self, window: Window, expected: Mapping[str, Prediction]) -> dict[str, Prediction]:
         """Leave out who shares a code and is out of reach, or is expected where another of that code is."""
@@ -117,7 +127,7 @@ class Roll:
                 out |= {e: expected[e] for e in asked}
                 continue
             flight_s = {e: self._begins_s(expected[e]) - self._offset_s[e] - window.sync_s for e in asked}
-            near = [e for e in asked if flight_s[e] < OUT_OF_REACH_M / 343.0]
+            near = [e for e in asked if flight_s[e] < OUT_OF_REACH_M / self._sound_speed_mps]
             for e in near:
                 rivals = [expected[o] for o in near if o != e]
                 if all(self._apart(expected[e], r, self._waveforms[head]) for r in rivals):
@@ -133,47 +143,53 @@ class Roll:
     def _begins_s(self, p: Prediction) -> float:
         return p.arrival_s - self._waveforms[p.emitter].duration_s / 2
 
-    def _call_expected(self, within: Mapping[str, tuple[float, float]], expected: Mapping[str, Prediction]) -> Call:
+    def _call_expected(
+        self, window: Window, within: Mapping[str, tuple[float, float]], expected: Mapping[str, Prediction]
+    ) -> Call:
         windows: dict[str, tuple[float, float]] = {}
         predictions: dict[str, Prediction] = {}
-        ago: dict[str, int] = {}
+        before_s: dict[str, float] = {}
         for e, p in expected.items():
             if not self.short:
-                windows[e], predictions[e], ago[e] = within[e], p, 0
+                windows[e], predictions[e], before_s[e] = within[e], p, 0.0
                 continue
             opens_s, closes_s = within[e]
             reach_s, length_s = 5 * p.arrival_sd_s + 1e-3, self._waveforms[e].duration_s
             periods = int(np.floor((self._begins_s(p) - opens_s) / self.period_s))
             for mark, back in ((EARLIER, periods + 1), ("", periods), (LATER, periods - 1)):
-                arrival_s = p.arrival_s - back * self.period_s
+                since_s = window.since_s(back, self.period_s)
+                arrival_s = p.arrival_s - since_s
                 begins_s = arrival_s - length_s / 2
                 if not mark or opens_s - length_s < begins_s < closes_s + length_s:
                     windows[e + mark] = (begins_s - reach_s, begins_s + reach_s)
                     predictions[e + mark] = replace(p, emitter=e + mark, arrival_s=arrival_s)
-                    ago[e + mark] = back
-        return Call(windows, predictions, ago)
+                    before_s[e + mark] = since_s
+        return Call(windows, predictions, before_s)
 
     def sent_s(self, window: Window, delay_s: float, call: Call) -> dict[str, float]:
         """When each burst called for would begin to be heard had it no way to go, recorder's clock, by name."""
         out: dict[str, float] = {}
         for name in call.windows:
-            emitter, back = name, call.periods_ago.get(name, 0)
+            emitter = name
             if self.short and name.endswith((EARLIER, LATER)):
                 emitter = name.removesuffix(EARLIER).removesuffix(LATER)
-            out[name] = window.sync_s + self._offset_s[emitter] + delay_s - (back * self.period_s if back else 0.0)
+            out[name] = window.sync_s + self._offset_s[emitter] + delay_s - call.sent_before_s.get(name, 0.0)
         return out
 
     def heard(self, found: tuple[Detection, ...], call: Call) -> Iterator[Detection]:
-        """Yield what was heard of this epoch, with the period it was sent in where that is known."""
+        """Yield what was heard of this epoch, and by how much earlier it was sent where that is known."""
         for d in found:
             if self.short and d.emitter.endswith((EARLIER, LATER)):
                 continue
-            yield replace(d, periods_ago=call.periods_ago.get(d.emitter, 0))
+            yield replace(d, sent_before_s=call.sent_before_s.get(d.emitter, 0.0))
 
-    def whose(self, emitter: str) -> list[tuple[str, float]]:
-        """List whose a burst may be: (beacon id, seconds of flight beyond those it has as the first beacon's)."""
-        back_s = [0.0]
-        if self.short:
-            back_s = [n * self.period_s for n in range(int(np.floor(self.reach_s / self.period_s)) + 1)]
+    def whose(self, emitter: str, window: Window) -> list[tuple[str, float]]:
+        """List whose a burst may be: (beacon id, seconds of flight beyond those it has as the first of its code)."""
+        most = int(np.floor(self._across_s / self.period_s)) if self.short else 0
+        back_s = [window.since_s(n, self.period_s) for n in range(most + 1)]
         own_s = self._offset_s[emitter]
         return [(e, own_s - self._offset_s[e] + more_s) for e in self.sharing[emitter] for more_s in back_s]
+
+    def head(self, emitter: str) -> str:
+        """Return the first beacon of an emitter's code: what it is listened for as where nothing is predicted."""
+        return next(head for head, group in self.sharing.items() if emitter in group)

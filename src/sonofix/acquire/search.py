@@ -292,7 +292,7 @@ def _combine(parted, beta, low, high, middle, carrier_hz, rate_hz, centre, lengt
         ahead = _turned_by(2.0 * np.pi * carrier_hz / rate_hz * off * size)
         sample = _turned_by(2.0 * np.pi * carrier_hz / rate_hz * beta[j])
         for p in range(parts):
-            shift = int(np.rint(off * u))
+            shift = min(max(int(np.rint(off * u)), -slip), slip)
             value = phase
             for _ in range(abs(shift)):
                 value *= sample if shift > 0 else np.conj(sample)

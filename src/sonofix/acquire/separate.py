@@ -51,6 +51,9 @@ MATCHED = 10 ** (-4 / 10)
 FLANK = 0.5
 """Of the shortest time a burst resolves: farther from the highest peak, a burst is on its flank."""
 
+BESIDE_OTHERS = 2.0
+"""Over its threshold: what is fainter beside others, clear as it was when found, may have been what a poor fit left."""
+
 CLEARED = 0.5
 """Times the threshold: what was clear when found must keep of it when all else is taken away."""
 
@@ -119,6 +122,8 @@ class Separation:
         As in `plan.Plan`.
     watch : Watch or None
         Is told what is done.
+    missing : bool (n,) or None
+        Samples that were never recorded: they count for nothing.
 
     Attributes
     ----------
@@ -146,6 +151,7 @@ class Separation:
         kappa_sd: float,
         false_alarm_rate: float,
         watch: Watch | None = None,
+        missing: NDArray[np.bool_] | None = None,
     ) -> None:
         self.band, self.banks, self.windows = band, banks, windows
         self.baseband, self.start_s = baseband, start_s
@@ -158,11 +164,13 @@ class Separation:
         self.joint = Joint(
             baseband - self._tone(), start_s, band.rate_hz, kappa_sd, band.whiteness, max(1, 2 * len(banks))
         )
+        if missing is not None and missing.any():
+            self.joint.leave_out(missing)
         self.floor = self._margin_power()
         self.predictions: Mapping[str, Prediction] = {}
 
-    def run(self, predictions: Mapping[str, Prediction]) -> None:
-        """Find all there is, where it is predicted; if nothing came as predicted, everywhere."""
+    def run(self, predictions: Mapping[str, Prediction], everywhere: bool = True) -> None:
+        """Find all there is, where it is predicted; if nothing came as predicted, ``everywhere`` if that is wished."""
         if not self.banks:
             return
         self.predictions = predictions
@@ -171,8 +179,9 @@ class Separation:
             # nothing came as predicted: then the prediction is what is wrong
             self._tell("unpredicted", ())
             self._keep([])
-            self.predictions = {}
-            self._take_apart()
+            if everywhere:
+                self.predictions = {}
+                self._take_apart()
 
     def _take_apart(self) -> None:
         self._take_beacons()
@@ -221,13 +230,13 @@ class Separation:
         clicks = find_clicks(self.joint.residual, shortest_s * self.band.rate_hz)
         if not len(clicks):
             return
-        aside = np.zeros(len(self.baseband), bool)
+        aside = ~self.joint.counted
         for begin, end in clicks:
             aside[begin:end] = True
         self.joint.leave_out(aside)
         self._settled = False
         self._settle()
-        lasted_ms = 1e3 * np.sum(aside) / self.band.rate_hz
+        lasted_ms = 1e3 * float(np.sum(np.diff(clicks, axis=1))) / self.band.rate_hz
         self.notes.append(f"{len(clicks)} clicks or drop-outs, {lasted_ms:.0f} ms in all, were left out")
         self._tell("aside", ())
 
@@ -253,10 +262,11 @@ class Separation:
         if self.joint.matched(i) < MATCHED * self.energy(i):
             return False
         above = self.energy(i) / (sound.threshold * noise)
-        if sound.clear and above > CLEARED:
+        alone = all(s.bank is sound.bank for s in self.sounds)
+        if sound.clear and above > (CLEARED if alone else BESIDE_OTHERS):
             return True
         # among echoes the direct path need not be the highest of all
-        return (above > 1.0 and (not sound.sought or disturbed)) or self._stands_out(i, disturbed)
+        return (above > 1.0 and (disturbed or (alone and not sound.sought))) or self._stands_out(i, disturbed)
 
     def _stands_out(self, i: int, disturbed: bool) -> bool:
         """Whether a burst stands out of a search of its code in what all other bursts leave.
@@ -469,6 +479,7 @@ class Separation:
                 out.append(
                     detection_of(
                         bank.emitter,
+                        bank.waveform,
                         self.joint.bursts[first],
                         bursts,
                         covariances[first] * louder,

@@ -10,7 +10,6 @@ import typer
 from sonofix.cli.console import Stopped, drawing, figure_text, length_text, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-
     from sonofix.records import Calibration, Recording
     from sonofix.site import Beacon, Site
 

@@ -14,7 +14,6 @@ import typer
 from sonofix.cli.console import Stopped, counted, drawing, length_text, print_table, progress_bar, speaker, watched
 
 if TYPE_CHECKING:
-
     from sonofix.records import BandInsight, BeaconInsight, Insight, Recording
     from sonofix.site import Site
 

@@ -12,11 +12,16 @@ from sonofix.geometry import POSE, from_arm, open_arms
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
+from sonofix.track import steps, wheels
+from sonofix.track.inputs import STEP, WHEELS, Inputs
 
 SIZE = len(POSE)
 
 SOUND_SPEED_MPS = 343.0
 """Near enough to turn a clock's speed into m/s."""
+
+RANGE_SCALE_SD, RANGE_BIAS_SD_M = 0.05, 0.1
+"""Of ranges stated by others: by what share of the way, and by how much, all may be too long."""
 
 INSTANT_S = 1e-9
 """Instants that differ by less are one: nothing moves meanwhile."""
@@ -43,14 +48,16 @@ class Belief:
     Attributes
     ----------
     time_s : float
-    mean : float64 (8 V + 2,)
-        Each vehicle's `geometry.POSE`, then clock offset (m) and drift (m/s).
-    covariance : float64 (8 V + 2, 8 V + 2)
+    mean : float64 (8 V + E + 2,)
+        Each vehicle's `geometry.POSE`, the E states that ``inputs`` add, then clock offset (m) and drift (m/s).
+    covariance : float64 (8 V + E + 2, 8 V + E + 2)
         Zero rows where a component is known or not estimated.
-    free : bool (8 V + 2,)
+    free : bool (8 V + E + 2,)
         What is estimated.
     placed : bool (V,)
         Vehicles that have a position yet.
+    inputs : Inputs or None
+        What the vehicles' own sensors tell, past and to come; only what is past enters.
     """
 
     time_s: float
@@ -58,19 +65,28 @@ class Belief:
     covariance: Floats
     free: NDArray[np.bool_]
     placed: NDArray[np.bool_]
+    inputs: Inputs | None = None
 
     def pose(self) -> Floats:
         """Poses (V, 8)."""
-        return self.mean[:-2].reshape(-1, SIZE)
+        return self.mean[: SIZE * len(self.placed)].reshape(-1, SIZE)
 
 
-def blank(site: Site) -> Belief:
+def blank(site: Site, inputs: Inputs | None = None) -> Belief:
     """Return the belief before anything was heard."""
-    n = SIZE * len(site.vehicles) + 2
-    mean = np.zeros(n)
+    n = SIZE * len(site.vehicles) + (inputs.size if inputs else 0) + 2
+    mean, covariance, free = np.zeros(n), np.zeros((n, n)), np.zeros(n, bool)
     for i, vehicle in enumerate(site.vehicles):
         mean[SIZE * i + 2] = vehicle.z_m or 0.0
-    return Belief(0.0, mean, np.zeros((n, n)), np.zeros(n, bool), np.zeros(len(site.vehicles), bool))
+    if inputs is not None:
+        for room, slots in ((steps, inputs.step_slot), (wheels, inputs.wheel_slot)):
+            for slot in slots[slots >= 0]:
+                room.begin(covariance, free, int(slot))
+        if inputs.range_slot >= 0:
+            for i, sd in ((0, RANGE_SCALE_SD), (1, RANGE_BIAS_SD_M)):
+                covariance[inputs.range_slot + i, inputs.range_slot + i] = sd**2
+                free[inputs.range_slot + i] = True
+    return Belief(0.0, mean, covariance, free, np.zeros(len(site.vehicles), bool), inputs)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -104,14 +120,47 @@ def age(mean, covariance, free, placed, densities, dt):
 
 
 def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
-    """Age a belief: positions move with their velocities, uncertainty grows with the white acceleration's integral."""
+    """Age a belief: positions move with their velocities, uncertainty grows with the white acceleration's integral.
+
+    What sensors told of the motion on the way enters at its own time.
+    """
     dt = time_s - belief.time_s
     if abs(dt) < INSTANT_S or not belief.placed.any():
         return replace(belief, time_s=time_s)
-    mean, covariance = belief.mean.copy(), belief.covariance.copy()
+    mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free
     densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd])
-    age(mean, covariance, belief.free, belief.placed, densities, float(dt))
-    return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
+    inputs, now_s = belief.inputs, belief.time_s
+    if inputs is None:
+        age(mean, covariance, free, belief.placed, densities, float(dt))
+        return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
+    free = free.copy()
+    for row in (*inputs.within(now_s, time_s), None):
+        until_s = time_s if row is None else float(inputs.time_s[row])
+        age(mean, covariance, free, belief.placed, densities, until_s - now_s)
+        for vehicle, (step, wheel) in enumerate(
+            zip(inputs.step_slot.tolist(), inputs.wheel_slot.tolist(), strict=True)
+        ):
+            if step >= 0:
+                steps.wander(mean, covariance, vehicle, step, until_s - now_s, bool(belief.placed[vehicle]))
+            if wheel >= 0:
+                wheels.wander(covariance, free, vehicle, wheel, until_s - now_s)
+        if row is not None and belief.placed[inputs.vehicle[row]]:
+            _sense(mean, covariance, free, inputs, row)
+        now_s = until_s
+    return replace(belief, time_s=time_s, mean=mean, covariance=covariance, free=free)
+
+
+def _sense(mean: Floats, covariance: Floats, free: NDArray[np.bool_], inputs: Inputs, row: int) -> None:
+    """Let one row of a vehicle's sensors enter, in place, at its time."""
+    vehicle = int(inputs.vehicle[row])
+    first, second, third, fourth = inputs.value[row].tolist()
+    if inputs.kind[row] == STEP:
+        steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second)
+    elif inputs.kind[row] == WHEELS:
+        slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
+        wheels.take(mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm)
+    else:
+        wheels.point(mean, covariance, free, vehicle, first)
 
 
 def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
@@ -141,6 +190,9 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
         mean[clock] = [fix.clock_offset_m or 0.0, 0.0]
         covariance[-1, -1] = (CLOCK_SPEED_SD * SOUND_SPEED_MPS) ** 2
         free[clock] = True
+    if belief.inputs is not None:
+        steps.lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]))
+        wheels.lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]))
     index = [names[state] for state in fix.states]
     covariance[np.ix_(index, index)] = fix.covariance
     free[index] = True
@@ -172,6 +224,17 @@ def start_at(
     placed = belief.placed.copy()
     placed[vehicle] = True
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
+
+
+def reopen(belief: Belief, vehicle: int, far_m: float) -> Belief:
+    """Return a belief in which a vehicle has been pushed: up to about ``far_m`` aside, at any speed up to 1 m/s."""
+    covariance, mean, free = belief.covariance.copy(), belief.mean.copy(), belief.free.copy()
+    for i, sd in ((0, far_m), (1, far_m), (4, 1.0), (5, 1.0)):
+        covariance[SIZE * vehicle + i, SIZE * vehicle + i] += sd**2
+    if belief.inputs is not None:
+        steps.lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]))
+        wheels.lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]))
+    return replace(belief, mean=mean, covariance=covariance, free=free)
 
 
 def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estimate:

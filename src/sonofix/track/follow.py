@@ -12,8 +12,10 @@ from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
-from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, start_at
-from sonofix.track.update import update
+from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, reopen, start_at
+from sonofix.track.course import Course
+from sonofix.track.inputs import Inputs
+from sonofix.track.update import strangeness, update
 
 PATIENCE = 3
 """Epochs in which most rows are refused before the track is put where the ranges say."""
@@ -24,6 +26,9 @@ noise alone comes there once in three million epochs."""
 
 DOUBT_RATE = 0.05
 """How fast the variance of stated ranges is scaled, per range."""
+
+SLIPPED_M = 1.0
+"""How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
 
 GATHER_S = 5.0
 """Where single epochs are too poor for a fix, ranges of this long are gathered for one."""
@@ -38,30 +43,35 @@ class Follower:
     motion : Motion
     free_running : bool
         The clock offset is another in every epoch (a sounding vehicle on its own clock).
+    inputs : Inputs or None
+        What the vehicles' own sensors tell of their motion.
     """
 
-    def __init__(self, site: Site, motion: Motion | None = None, free_running: bool = False) -> None:
+    def __init__(
+        self, site: Site, motion: Motion | None = None, free_running: bool = False, inputs: Inputs | None = None
+    ) -> None:
         self.site = site
         self.motion = motion or Motion()
         self.free_running = free_running
-        self.belief = blank(site)
+        self.belief = blank(site, inputs)
         self._arms = open_arms(site)
         self._refused = np.zeros(len(site.vehicles), int)
         self._heard = np.zeros(len(site.vehicles), bool)
         self._recent: list[RangeEpoch] = []
         self._lag_s = 0.0
         self._doubt = 1.0
+        self._course = Course()
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
         """Place a vehicle at a pose known beforehand."""
         who = [v.id for v in self.site.vehicles].index(vehicle)
         known = self.site.vehicles[who].z_m is not None
+        inputs = self.belief.inputs
+        turns = bool(turning(self.site)[who]) or (inputs is not None and bool(inputs.headed[who]))
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         x, y = self._arms[who]
         position_m = position_m + np.array([cos * x - sin * y, sin * x + cos * y, 0.0])
-        self.belief = start_at(
-            replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, bool(turning(self.site)[who])
-        )
+        self.belief = start_at(replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns)
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -88,10 +98,14 @@ class Follower:
         stated = epoch.snr_db is None
         asked = replace(epoch, covariance_m2=self._doubt * epoch.covariance_m2) if stated else epoch
         # ranges that placed a vehicle have had their say
-        self.belief, used, surprise = update(self.belief, asked, links, candidates & ~taken)
+        before = self.belief
+        self.belief, used, surprise = update(before, asked, links, candidates & ~taken)
+        if before.inputs is not None:
+            used = self._slipped(before, asked, links, candidates & ~taken, used, events)
         used |= taken
         if stated:
             self._learn(surprise)
+        self.belief = self._course.head(self.belief)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
@@ -105,6 +119,42 @@ class Follower:
         time_s = float(np.mean(moments))
         self._lag_s = time_s - epoch.sync_s
         return time_s
+
+    def _slipped(
+        self,
+        before: Belief,
+        epoch: RangeEpoch,
+        links: Links,
+        asked: NDArray[np.bool_],
+        used: NDArray[np.bool_],
+        events: list[Event],
+    ) -> NDArray[np.bool_]:
+        """Find the vehicle that moved without its own sensors noticing, where many ranges are refused.
+
+        It is the one whose place, once opened, makes the epoch as a whole most likely; the epoch is then taken in anew.
+        Returns the rows used.
+        """
+        refused = asked & ~used
+        best: tuple[float, int, Belief] | None = None
+        for who in np.flatnonzero(before.placed).tolist():
+            own = asked & self._touches(links, who)
+            if np.count_nonzero(refused & own) < max(2, np.count_nonzero(own) / 2):
+                continue
+            opened = reopen(before, who, SLIPPED_M)
+            odds = strangeness(opened, epoch, links, asked)
+            if best is None or odds < best[0]:
+                best = odds, who, opened
+        if best is None:
+            return used
+        _, who, opened = best
+        opened, again, _ = update(opened, epoch, links, asked)
+        if np.count_nonzero(again) <= np.count_nonzero(used):
+            return used
+        self.belief = opened
+        apart = np.hypot(*(self.belief.pose()[who, :2] - before.pose()[who, :2]))
+        text = f"{np.count_nonzero(refused)} ranges disagreed: {apart:.2f} m from where its own sensors had it"
+        events.append(Event(before.time_s, self.site.vehicles[who].id, "slip", text))
+        return again
 
     def _clock(self, epoch: RangeEpoch, fixes: tuple[Fix, ...]) -> None:
         """Open the clock offset anew where nothing ties it to the last epoch's: a free-running source, or a start."""
@@ -131,6 +181,12 @@ class Follower:
             self._doubt *= float(np.exp(DOUBT_RATE * (min(value, 9.0) - 1.0)))
         self._doubt = float(np.clip(self._doubt, 1.0, 1e4))
 
+    @property
+    def _corrected(self) -> bool:
+        """Whether the track knows better than a fix how far stated ranges are off."""
+        inputs = self.belief.inputs
+        return inputs is not None and inputs.range_slot >= 0
+
     def _gather(self, epoch: RangeEpoch) -> None:
         if len(epoch):
             self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
@@ -143,7 +199,8 @@ class Follower:
             if self.belief.placed[who] and not lost:
                 continue
             start = found
-            if found.status == "too-few" and np.any(self._touches(links, who)):
+            again = lost and self._corrected
+            if (found.status == "too-few" or again) and np.any(self._touches(links, who)):
                 start = self._gathered(found.vehicle)
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue
@@ -159,6 +216,8 @@ class Follower:
     def _contradicted(self, who: int, found: Fix) -> bool:
         """Whether a fix with ranges to check by says that a vehicle is not at all where its track has it."""
         position = found.position_m
+        if self._corrected:
+            return False
         if not self.belief.placed[who] or found.status != "ok" or position is None or found.covariance is None:
             return False
         if np.count_nonzero(found.used) <= len([s for s in found.states if s in ("x", "y", "z", "yaw", "clock")]):
@@ -188,6 +247,9 @@ class Follower:
             range_rate_sd_mps=None,
             snr_db=None,
         )
+        if self._corrected and self.belief.inputs is not None:
+            scale, bias_m = self.belief.mean[self.belief.inputs.range_slot :][:2]
+            merged = replace(merged, range_m=(merged.range_m - bias_m) / (1.0 + scale))
         return fix(merged, self.site, vehicle)
 
     def _touches(self, links: Links, who: int) -> NDArray[np.bool_]:

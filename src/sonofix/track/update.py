@@ -48,10 +48,11 @@ def update(
     dt = epoch.time_s[rows] - belief.time_s
     noise = row_noise(epoch, links, rows, dt)
     measured = epoch.range_m[rows]
+    stated = epoch.snr_db is None
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
     links = links.rows(rows)
-    shown, derivative = rows_at(links, belief.mean, dt, epoch.sound_speed_mps, clock, with_rates)
+    shown, derivative = _expected(links, belief, belief.mean, dt, epoch, stated)
     miss = measured - shown
     crossed = derivative @ belief.covariance
     surprise = miss**2 / (np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal())
@@ -71,7 +72,7 @@ def update(
     mean, gain = belief.mean, np.zeros((0, 0))
     for k in range(iterations):
         if k:
-            shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, with_rates)
+            shown, derivative = _expected(links, belief, mean, dt, epoch, stated)
             miss, crossed = measured - shown, derivative @ belief.covariance
         gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
         moved = belief.mean + gain @ (miss - derivative @ (belief.mean - mean))
@@ -82,3 +83,32 @@ def update(
     keep = np.eye(len(mean)) - gain @ derivative
     covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
     return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2), used, surprise
+
+
+def _expected(
+    links: Links, belief: Belief, mean: Floats, dt: Floats, epoch: RangeEpoch, stated: bool
+) -> tuple[Floats, Floats]:
+    """Return what rows would show at a mean, and its derivative; ranges stated by others with errors of their own."""
+    clock, rates = epoch.clock == "common", epoch.range_rate_mps is not None
+    shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates)
+    if stated and belief.inputs is not None and belief.inputs.range_slot >= 0:
+        slot, n = belief.inputs.range_slot, len(dt)
+        derivative *= 1.0 + mean[slot]
+        derivative[:n, slot], derivative[:n, slot + 1] = shown[:n], 1.0
+        shown = shown * (1.0 + mean[slot])
+        shown[:n] += mean[slot + 1]
+    return shown, derivative
+
+
+def strangeness(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]) -> float:
+    """Minus twice the log likelihood (but for a constant) of all rows asked for, ranges and rates together."""
+    placed = np.append(belief.placed, True)
+    rows = np.flatnonzero(asked & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
+    dt = epoch.time_s[rows] - belief.time_s
+    shown, derivative = _expected(links.rows(rows), belief, belief.mean, dt, epoch, epoch.snr_db is None)
+    measured = epoch.range_m[rows]
+    if epoch.range_rate_mps is not None:
+        measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
+    expected = derivative @ belief.covariance @ derivative.T + row_noise(epoch, links, rows, dt)
+    miss = measured - shown
+    return float(miss @ np.linalg.solve(expected, miss) + np.linalg.slogdet(expected)[1])

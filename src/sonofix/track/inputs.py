@@ -1,0 +1,144 @@
+"""What a vehicle's own sensors tell of its motion, in order of time, and the states that correct them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.geometry import open_arms
+from sonofix.records import Floats, Table
+from sonofix.site import Site
+from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
+
+STEP_STATES = ("anchor_x", "anchor_y", "length", "heading")
+"""What a walker adds to the state: where the step before ended, and by what share of itself a step's length is told too
+long, by what angle its heading too far left."""
+
+WHEEL_STATES = ("anchor_x", "anchor_y", "anchor_yaw", "scale", "bias")
+"""What odometry adds: the pose at its row before, by what share of itself its speed is told too high, and its yaw rate
+at rest."""
+
+RANGE_STATES = ("range_scale", "range_bias")
+"""What ranges stated by others add: by what share of the way, and by how much, all of them are too long."""
+
+STEP, WHEELS, COMPASS = range(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """Rows of the recording's sensor tables, of all vehicles, in order of time.
+
+    Attributes
+    ----------
+    time_s : float64 (k,)
+        When each row is known: a step at its end, a row of odometry when the next one comes.
+    kind, vehicle : int (k,)
+        `STEP`, `WHEELS` or `COMPASS`; index of the vehicle it speaks of.
+    value : float64 (k, 4)
+        Length and heading of a step; way, turn and time of an arc by odometry, and what may have been turned unseen at
+        its end; heading of a compass. NaN where unknown.
+    step_slot, wheel_slot : int (V,)
+        Where each vehicle's `STEP_STATES` and `WHEEL_STATES` stand in a belief; −1: it has none.
+    headed : bool (V,)
+        Vehicles whose heading something tells.
+    arm : float64 (V, 2)
+        `geometry.open_arms`.
+    range_slot : int
+        Where `RANGE_STATES` stand; −1: ranges are our own, and right.
+    size : int
+        How many states are added in all.
+    """
+
+    time_s: Floats
+    kind: NDArray[np.int64]
+    vehicle: NDArray[np.int64]
+    value: Floats
+    step_slot: NDArray[np.int64]
+    wheel_slot: NDArray[np.int64]
+    headed: NDArray[np.bool_]
+    arm: Floats
+    range_slot: int
+    size: int
+
+    def within(self, after_s: float, until_s: float) -> range:
+        """Rows told after one instant and until another; none where the second is before the first."""
+        first, last = np.searchsorted(self.time_s, [after_s, until_s], side="right")
+        return range(int(first), int(last))
+
+
+def reckoned(inputs: Inputs, vehicle: int, until_s: float) -> Floats:
+    """Poses (n, 4) that odometry alone gives, from (0, 0, 0) on: time, x, y and heading at each of its rows so far."""
+    rows = np.flatnonzero((inputs.kind == WHEELS) & (inputs.vehicle == vehicle) & (inputs.time_s <= until_s))
+    way, turn = np.nan_to_num(inputs.value[rows, 0]), np.nan_to_num(inputs.value[rows, 1])
+    yaw = np.cumsum(turn)
+    middle = yaw - turn / 2
+    x, y = np.cumsum(way * np.cos(middle)), np.cumsum(way * np.sin(middle))
+    return np.column_stack([inputs.time_s[rows], x, y, yaw])
+
+
+def gather(site: Site, tables: Mapping[str, Table], stated: bool = False) -> Inputs | None:
+    """Bring the tables that the track uses (`steps`, `odometry`, `compass`) into one order of time; None without any.
+
+    A row with an empty cell tells nothing but its time. ``stated``: ranges come from others, with errors of their own.
+    """
+    ids = [v.id for v in site.vehicles]
+    parts: list[tuple[Floats, NDArray[np.int64], NDArray[np.int64], Floats]] = []
+    for kind, stem in ((STEP, "steps"), (WHEELS, "odometry"), (COMPASS, "compass")):
+        table = tables.get(stem)
+        if table is None or not ids or not len(table.columns["time_s"]):
+            continue
+        n = len(table.columns["time_s"])
+        whose = table.names.get("vehicle") or (ids[0],) * n
+        for i, name in enumerate(ids):
+            rows = np.array([w == name for w in whose])
+            own = {column: values[rows] for column, values in table.columns.items()}
+            if rows.any():
+                count = np.count_nonzero(rows)
+                parts.append((own["time_s"], np.full(count, kind), np.full(count, i), _values(kind, own)))
+    if not parts:
+        return None
+    time_s, kinds, vehicle, value = (np.concatenate(p) for p in zip(*parts, strict=True))
+    order = np.argsort(time_s, kind="stable")
+    # only a compass tells what odometry did not see; without one the doubt would stay
+    unaware = (kinds == WHEELS) & ~np.isin(vehicle, vehicle[kinds == COMPASS])
+    value[unaware, 3] = 0.0
+    size, slots = 0, np.full((2, len(ids)), -1, np.int64)
+    for kind, states in ((STEP, STEP_STATES), (WHEELS, WHEEL_STATES)):
+        for i in np.unique(vehicle[kinds == kind]).tolist():
+            slots[kind, i] = 8 * len(ids) + size
+            size += len(states)
+    range_slot = 8 * len(ids) + size if stated else -1
+    size += len(RANGE_STATES) if stated else 0
+    headed = np.array([bool(np.any((vehicle == i) & (kinds != STEP))) for i in range(len(ids))])
+    return Inputs(
+        time_s[order],
+        kinds[order],
+        vehicle[order],
+        value[order],
+        slots[0],
+        slots[1],
+        headed,
+        open_arms(site),
+        range_slot,
+        size,
+    )
+
+
+def _values(kind: int, own: Mapping[str, Floats]) -> Floats:
+    """Rows (k, 4) of one vehicle as `Inputs` has them."""
+    out = np.full((len(own["time_s"]), 4), np.nan)
+    if kind == STEP:
+        out[:, 0], out[:, 1] = own["length_m"], own["heading_rad"]
+    elif kind == COMPASS:
+        out[:, 0] = own["heading_rad"]
+    else:
+        # each row holds until the next, where it becomes known what was driven
+        dt = np.diff(own["time_s"])
+        out[1:, 0], out[1:, 1], out[1:, 2] = own["v_mps"][:-1] * dt, own["yaw_rate_radps"][:-1] * dt, dt
+        slow = np.abs(own["v_mps"]) < STANDING_MPS
+        out[1:, 3] = np.where(slow[:-1] & ~slow[1:], UNSEEN_RAD, 0.0)
+        out[0, 3] = 0.0
+    return out

@@ -1,0 +1,198 @@
+"""Wheel odometry and compass: how they carry a vehicle, and what they learn of their own errors.
+
+A row of odometry holds until the next, so it is told at that one's time: an arc driven since. As with steps, the state
+keeps the pose at the row before (the anchor), and the arc measures the difference of the two poses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.geometry import POSE
+from sonofix.records import Floats
+
+SCALE_SD = 0.05
+"""Of the share of itself by which a speed is told too high; it stays what it is."""
+
+SCALE_PSD = 1e-6
+"""In 1/s, how it wanders."""
+
+BIAS_SD_RADPS = 0.01
+"""Of a yaw rate that is told at rest."""
+
+BIAS_PSD = 1e-8
+"""In rad²/s³, how it wanders."""
+
+CREEP_PSD = 1e-6
+"""In m²/s, how a vehicle strays from its odometry along and across even at rest."""
+
+SLIP_M = 4e-4
+"""In m²/m, how it strays for each metre driven."""
+
+TWIST_PSD = 1e-5
+"""In rad²/s, the same of its heading."""
+
+TWIST_M = 4e-4
+"""In rad²/m."""
+
+TWIST_RAD = 4e-4
+"""In rad²/rad."""
+
+UNSEEN_RAD = 0.2
+"""What a vehicle that stood may have turned on the spot between two rows, before it drives off."""
+
+STANDING_MPS = 0.01
+"""A lower speed is rest."""
+
+AGILE_TURN_PSD = 20.0
+"""White angular acceleration in rad²/s³ that a vehicle with odometry adds to that of others: it turns on the spot, and
+its rows tell."""
+
+LONGEST_S = 2.0
+"""A row that is followed by none for longer tells nothing."""
+
+UNLIKELY = 40.0
+"""Squared distance, over its variance, of an arc that is not believed."""
+
+COMPASS_SD_RAD = 0.05
+"""Of one reading; steel nearby is the rest, which `ROBUST` bounds."""
+
+ROBUST = 2.0
+"""A reading that is off by more deviations than this counts as much less (Huber 1964)."""
+
+
+def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
+    """Open the errors of a vehicle's odometry, in place, before anything is known of them."""
+    for i, sd in ((slot + 3, SCALE_SD), (slot + 4, BIAS_SD_RADPS)):
+        covariance[i, i] = sd**2
+        free[i] = True
+
+
+def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int, dt: float) -> None:
+    """Let the errors of odometry wander for ``dt``, in place, and its turns be as free as rows may tell."""
+    span = abs(dt)
+    covariance[slot + 3, slot + 3] += SCALE_PSD * span
+    covariance[slot + 4, slot + 4] += BIAS_PSD * span
+    at = len(POSE) * vehicle + 3
+    if free[at]:
+        covariance[at, at] += AGILE_TURN_PSD * span**3 / 3
+        covariance[at, at + 4] += AGILE_TURN_PSD * dt * span / 2
+        covariance[at + 4, at] += AGILE_TURN_PSD * dt * span / 2
+        covariance[at + 4, at + 4] += AGILE_TURN_PSD * span
+
+
+def lift(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
+    """Take the anchor away, in place. ``slot`` −1: nothing."""
+    if slot < 0:
+        return
+    own = slice(slot, slot + 3)
+    mean[own] = 0.0
+    covariance[own, :] = covariance[:, own] = 0.0
+    free[own] = False
+
+
+def take(
+    mean: Floats,
+    covariance: Floats,
+    free: NDArray[np.bool_],
+    vehicle: int,
+    slot: int,
+    arc: tuple[float, float, float, float],
+    arm: Floats,
+) -> None:
+    """Correct a belief at the end of an arc, in place, and put the anchor there.
+
+    ``arc`` is way, turn, time, and what it may have turned unseen at their end; ``arm`` (2,) is where the motion is
+    followed, from the vehicle's origin.
+    """
+    at = len(POSE) * vehicle
+    way, turn, dt, unseen = arc
+    if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and dt <= LONGEST_S:
+        _correct(mean, covariance, vehicle, slot, (way, turn, dt), arm)
+    if free[at + 3]:
+        covariance[at + 3, at + 3] += unseen**2
+    for own, of in ((slice(slot, slot + 2), slice(at, at + 2)), (slot + 2, at + 3)):
+        mean[own] = mean[of]
+        covariance[own, :] = covariance[of, :]
+        covariance[:, own] = covariance[:, of]
+    free[slot : slot + 2] = True
+    free[slot + 2] = free[at + 3]
+
+
+def _correct(
+    mean: Floats, covariance: Floats, vehicle: int, slot: int, arc: tuple[float, float, float], arm: Floats
+) -> None:
+    """Correct a belief by one arc, in place: an extended Kalman update in Joseph form.
+
+    With a and α the anchor's place and heading, k and b the errors of way and yaw rate, and ω = turn − b dt: ψ = α + ω,
+    p − a = (1 − k) way sinc(ω/2) u(α + ω/2) + (R(ψ) − R(α)) arm.
+    """
+    at = len(POSE) * vehicle
+    way, turn, dt = arc
+    before, now = mean[slot + 2], mean[at + 3]
+    turned = turn - mean[slot + 4] * dt
+    bent = float(np.sinc(turned / (2 * np.pi)))
+    chord = way * (1.0 - mean[slot + 3]) * bent
+    middle = before + turned / 2
+    along = np.array([np.cos(middle), np.sin(middle)])
+    across = np.array([-along[1], along[0]])
+
+    def swung(yaw: float) -> Floats:
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return np.array([cos * arm[0] - sin * arm[1], sin * arm[0] + cos * arm[1]])
+
+    here, there = swung(now), swung(before)
+    shift = chord * along + here - there
+    miss = np.append(shift - (mean[at : at + 2] - mean[slot : slot + 2]), before + turned - now)
+    derivative = np.zeros((3, len(mean)))
+    derivative[0, at] = derivative[1, at + 1] = derivative[2, at + 3] = 1.0
+    derivative[0, slot] = derivative[1, slot + 1] = derivative[2, slot + 2] = -1.0
+    derivative[:2, slot + 2] = -chord * across + np.array([-there[1], there[0]])
+    derivative[:2, at + 3] = -np.array([-here[1], here[0]])
+    derivative[:2, slot + 3] = way * bent * along
+    derivative[:2, slot + 4] = chord * dt / 2 * across
+    derivative[2, slot + 4] = dt
+    place = CREEP_PSD * dt + SLIP_M * abs(way)
+    heading = TWIST_PSD * dt + TWIST_M * abs(way) + TWIST_RAD * abs(turn)
+    _update(mean, covariance, miss, derivative, np.diag([place, place, heading]), UNLIKELY)
+
+
+def _update(mean: Floats, covariance: Floats, miss: Floats, derivative: Floats, noise: Floats, unlikely: float) -> None:
+    crossed = derivative @ covariance
+    expected = crossed @ derivative.T + noise
+    if miss @ np.linalg.solve(expected, miss) > unlikely:
+        return
+    gain = np.linalg.solve(expected, crossed).T
+    keep = np.eye(len(mean)) - gain @ derivative
+    after = keep @ covariance @ keep.T + gain @ noise @ gain.T
+    mean += gain @ miss
+    covariance[:] = (after + after.T) / 2
+
+
+def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, heading_rad: float) -> None:
+    """Correct a heading by a compass reading, in place; the first reading gives the heading."""
+    at = len(POSE) * vehicle + 3
+    if not np.isfinite(heading_rad):
+        return
+    if not free[at]:
+        open_heading(mean, covariance, free, vehicle, heading_rad, 2 * COMPASS_SD_RAD)
+        return
+    miss = float(np.angle(np.exp(1j * (heading_rad - mean[at]))))
+    derivative = np.zeros((1, len(mean)))
+    derivative[0, at] = 1.0
+    off = abs(miss) / np.sqrt(covariance[at, at] + COMPASS_SD_RAD**2)
+    noise = COMPASS_SD_RAD**2 * max(1.0, off / ROBUST)
+    _update(mean, covariance, np.array([miss]), derivative, np.array([[noise]]), np.inf)
+
+
+def open_heading(
+    mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, yaw_rad: float, sd_rad: float
+) -> None:
+    """Begin to follow a heading, in place; how fast it turns starts at 0 ± 1 rad/s."""
+    for i, value, sd in ((3, yaw_rad, sd_rad), (7, 0.0, 1.0)):
+        at = len(POSE) * vehicle + i
+        mean[at] = value
+        covariance[at, :] = covariance[:, at] = 0.0
+        covariance[at, at] = sd**2
+        free[at] = True

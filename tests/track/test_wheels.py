@@ -1,0 +1,195 @@
+"""Vehicles carried by odometry and compass: the update by its plain twin, long runs, slips, pushes and bad readings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+from scipy.stats import chi2
+
+from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of
+from sonofix.files import read_recording, read_truth
+from sonofix.flow import Street, run
+from sonofix.records import Floats, Table
+from sonofix.track import wheels
+from sonofix.track.belief import Motion, estimate, predict
+from sonofix.track.follow import Follower
+from sonofix.track.inputs import gather
+
+OUTSIDE = 1e-6
+SLOT = 8
+SITE = make_site(HALL, level_m=1.1)
+ARM = np.array([0.3, -0.2])
+
+
+def test_an_arc_is_the_textbook_update_by_numerical_derivatives(rng: np.random.Generator) -> None:
+    n = 8 + 5 + 2
+    for _ in range(10):
+        half = 0.02 * rng.standard_normal((n, n))
+        mean, covariance = 0.05 * rng.standard_normal(n), half @ half.T
+        way, turn, dt = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.1
+
+        def turned(yaw: float) -> Floats:
+            return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ ARM
+
+        def disagreement(x: Floats, way: float = way, turn: float = turn, dt: float = dt) -> Floats:
+            # the origin drives the arc in a thousand short pieces; the arm turns with it
+            pieces = 1000
+            rate = (turn - x[SLOT + 4] * dt) / pieces
+            yaw = x[SLOT + 2] + rate * (np.arange(pieces) + 0.5)
+            step = way * (1 - x[SLOT + 3]) / pieces
+            driven = np.array([np.sum(step * np.cos(yaw)), np.sum(step * np.sin(yaw))])
+            place = x[0:2] - x[SLOT : SLOT + 2] - driven - turned(x[3]) + turned(x[SLOT + 2])
+            return np.append(place, x[3] - x[SLOT + 2] - pieces * rate)
+
+        h = np.array([approx_fprime(mean, lambda x, i=i: disagreement(x)[i], 1e-7) for i in range(3)])
+        strays = wheels.CREEP_PSD * dt + wheels.SLIP_M * abs(way)
+        twists = wheels.TWIST_PSD * dt + wheels.TWIST_M * abs(way) + wheels.TWIST_RAD * abs(turn)
+        s = h @ covariance @ h.T + np.diag([strays, strays, twists])
+        if disagreement(mean) @ np.linalg.solve(s, disagreement(mean)) > wheels.UNLIKELY:
+            continue
+        gain = covariance @ h.T @ np.linalg.inv(s)
+        got, after = mean.copy(), covariance.copy()
+        wheels.take(got, after, np.ones(n, bool), 0, SLOT, (way, turn, dt, 0.0), ARM)
+        np.testing.assert_allclose(got[:8], (mean - gain @ disagreement(mean))[:8], atol=3e-5)
+        np.testing.assert_allclose(after[:8, :8], ((np.eye(n) - gain @ h) @ covariance)[:8, :8], atol=3e-5)
+        np.testing.assert_array_equal(got[SLOT : SLOT + 3], got[[0, 1, 3]])
+
+
+def odometry(rows: Floats) -> Table:
+    return Table(
+        {"time_s": rows[:, 0], "v_mps": rows[:, 1], "yaw_rate_radps": rows[:, 2]}, {"vehicle": ("v",) * len(rows)}
+    )
+
+
+def reckoned(seed: int) -> tuple[float, float, float]:
+    """Error, NEES of x and y and of the heading after 10 s by odometry alone, errors drawn as the filter has them."""
+    rng = np.random.default_rng([3, seed])
+    scale, bias = wheels.SCALE_SD * rng.standard_normal(), wheels.BIAS_SD_RADPS * rng.standard_normal()
+    dt = 0.1
+    yaw, place = 0.3 + 0.1 * rng.standard_normal(), np.array([3.0, 3.0]) + 0.05 * rng.standard_normal(2)
+    rows, speed, rate = [], 0.3, 0.0
+    for k in range(101):
+        rows.append((dt * k, speed / (1 - scale), rate + bias))
+        if k == 100:
+            break
+        way, turn = speed * dt, rate * dt
+        place = place + way * np.array([np.cos(yaw + turn / 2), np.sin(yaw + turn / 2)])
+        place = place + np.sqrt(wheels.CREEP_PSD * dt + wheels.SLIP_M * way) * rng.standard_normal(2)
+        twist = wheels.TWIST_PSD * dt + wheels.TWIST_M * way / (1 - scale) + wheels.TWIST_RAD * abs(turn)
+        yaw += turn + np.sqrt(twist) * rng.standard_normal()
+        rate = float(np.clip(rate + 0.1 * rng.standard_normal(), -0.5, 0.5))
+        speed = float(np.clip(speed + 0.02 * rng.standard_normal(), 0.1, 0.5))
+    follower = Follower(SITE, inputs=gather(SITE, {"odometry": odometry(np.array(rows))}))
+    follower.start("v", -0.001, np.array([3.0, 3.0, 1.1]), 0.3)
+    got = estimate(predict(follower.belief, 10.0, Motion()), SITE, 0, "predicted")
+    miss = got.position_m[:2] - place
+    assert got.yaw_rad is not None
+    off = float(np.angle(np.exp(1j * (got.yaw_rad - yaw)))) / (got.sd("yaw") or np.nan)
+    return float(np.hypot(*miss)), float(miss @ np.linalg.solve(got.covariance[:2, :2], miss)), off**2
+
+
+def test_odometry_is_as_good_as_it_says() -> None:
+    runs = 100
+    found = np.array([reckoned(k) for k in range(runs)])
+    for column, degrees in ((1, 2), (2, 1)):
+        low, high = chi2.ppf([OUTSIDE / 2, 1 - OUTSIDE / 2], degrees * runs) / runs
+        assert low < found[:, column].mean() < high
+    assert np.sqrt(np.mean(found[:, 0] ** 2)) < 0.6
+
+
+def driving(scale: float, drive: Drive, until_s: float) -> Table:
+    times = np.arange(0.0, until_s, 0.1)
+    speed = float(np.hypot(*drive.velocity_mps[:2]))
+    return odometry(np.column_stack([times, np.full(len(times), speed * (1 + scale)), np.zeros(len(times))]))
+
+
+def test_a_wrong_scale_and_the_heading_are_found_by_driving(rng: np.random.Generator) -> None:
+    # one microphone at the origin: only the way that the track goes tells where the vehicle looks
+    drive, street = Drive((1.0, 1.0, 1.1), (0.4, 0.3, 0.0)), Street(SITE)
+    street.sense({"odometry": driving(0.08, drive, 12.0)})
+    for k in range(22):
+        step = street.walk(make_epoch(SITE, drive, 0.05 + 0.5 * k, rng=rng))
+    got, belief = step.estimates[0], street.follower.belief
+    assert got.yaw_rad == pytest.approx(np.arctan2(3, 4), abs=0.03)
+    assert belief.mean[SLOT + 3] == pytest.approx(0.08 / 1.08, abs=0.02)
+    assert np.hypot(*(got.position_m - drive.origin(got.time_s))[:2]) < 0.02
+
+
+def test_odometry_carries_through_silence(rng: np.random.Generator) -> None:
+    drive, street = Drive((1.0, 1.0, 1.1), (0.4, 0.3, 0.0)), Street(SITE)
+    street.sense({"odometry": driving(0.08, drive, 16.0)})
+    for k in range(30):
+        epoch = make_epoch(SITE, drive, 0.05 + 0.5 * k, rng=rng)
+        step = street.walk(rows_of(epoch, np.zeros(0, int)) if k > 19 else epoch)
+    got = step.estimates[0]
+    miss = (got.position_m - drive.origin(got.time_s))[:2]
+    assert got.source == "predicted"
+    assert np.hypot(*miss) < 0.2
+    assert (got.sd("x") or 1.0) < 0.2
+
+
+def test_a_compass_gives_the_heading_and_its_bad_readings_do_not(rng: np.random.Generator) -> None:
+    times = np.arange(0.0, 10.0, 0.1)
+    heading = 0.7 + 0.03 * rng.standard_normal(len(times))
+    heading[40::10] += rng.uniform(1.0, 5.0, len(heading[40::10]))
+    site = SITE
+    tables = {
+        "compass": Table({"time_s": times, "heading_rad": heading}),
+        "odometry": odometry(np.column_stack([times, np.zeros(len(times)), np.zeros(len(times))])),
+    }
+    street = Street(site)
+    street.sense(tables)
+    for k in range(18):
+        step = street.walk(make_epoch(site, Drive((3.0, 5.0, 1.1)), 0.05 + 0.5 * k, rng=rng))
+        if k > 2:
+            assert step.estimates[0].yaw_rad == pytest.approx(0.7, abs=0.06)
+
+
+def test_stated_ranges_that_are_all_too_long_are_found_out(rng: np.random.Generator) -> None:
+    # round a circle of 1.5 m, every range 5 % too long: a fix of each epoch alone is decimetres off
+    times = np.arange(0.0, 60.0, 0.1)
+    street, miss = Street(SITE), []
+    street.sense({"odometry": odometry(np.column_stack([times, 0.6 + 0 * times, 0.4 + 0 * times]))}, stated=True)
+    for k in range(119):
+        time_s = 0.5 * k + 0.05
+        place = (5.0 + 1.5 * np.sin(0.4 * time_s), 4.0 - 1.5 * np.cos(0.4 * time_s), 1.1)
+        epoch = make_epoch(SITE, Drive(place), rng=rng, stated=True)
+        heard = replace(epoch, time_s=np.full(6, time_s), sync_s=time_s, range_m=1.05 * epoch.range_m)
+        got = street.walk(heard).estimates[0]
+        miss.append(float(np.hypot(*(got.position_m - place)[:2])))
+    assert np.sqrt(np.mean(np.square(miss[40:]))) < 0.03
+
+
+def test_a_push_that_odometry_does_not_see_is_told_and_followed(captures: Path) -> None:
+    folder = captures / "team"
+    truths = read_truth(folder)
+    miss: dict[str, list[tuple[float, float]]] = {v: [] for v in truths}
+    slips = []
+    for step in run(read_recording(folder, to_run=True)):
+        slips += [(e.vehicle, e.time_s) for e in step.events if e.event == "slip"]
+        for got in step.estimates:
+            truth = truths[got.vehicle]
+            place = [np.interp(got.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]
+            miss[got.vehicle].append((got.time_s, float(np.hypot(*(got.position_m[:2] - place)))))
+    assert [v for v, _ in slips] == ["R1"]
+    assert 9.0 < slips[0][1] < 10.5
+    for vehicle, rows in miss.items():
+        errors = np.array([e for _, e in rows])
+        assert np.sqrt(np.mean(errors**2)) < 0.03, vehicle
+        assert errors[-1] < 0.02, vehicle
+
+
+@pytest.mark.parametrize(("name", "least"), [("labyrinth", 0.09), ("plaza1", 0.5)])
+def test_real_odometry_with_ranges_that_are_off(data: Path, name: str, least: float) -> None:
+    truth = next(iter(read_truth(data / name).values()))
+    miss = []
+    for step in islice(run(read_recording(data / name, to_run=True)), 700):
+        for got in step.estimates:
+            place = [np.interp(got.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]
+            miss.append(np.hypot(*(got.position_m[:2] - place)))
+    assert np.sqrt(np.mean(np.square(miss))) < least
