@@ -79,6 +79,13 @@ def water_fraction(temperature_c: ArrayLike, humidity: ArrayLike, pressure_kpa: 
     return np.asarray(h * enhancement * _saturation_pressure_pa(t_c) / p_pa)
 
 
+BY_KELVIN_MPS = 0.607
+"""What a kelvin changes the sound speed by: the rule of the second seed."""
+
+THERMOMETER_SD_K = 1.0
+"""Doubt about a temperature that is stated."""
+
+
 @overload
 def sound_speed_mps(
     temperature_c: float,
@@ -160,7 +167,7 @@ def sound_speed_linear_mps(temperature_c: ArrayLike) -> float | Floats:
     The rule knows no humidity: from 0 to 30 °C it lies 0.05 to 0.57 m/s above dry air and, from 10 °C on, below air of
     half humidity.
     """
-    speed = 331.5 + 0.607 * _checked("temperature_c", temperature_c)
+    speed = 331.5 + BY_KELVIN_MPS * _checked("temperature_c", temperature_c)
     return float(speed) if np.ndim(speed) == 0 else np.asarray(speed)
 
 

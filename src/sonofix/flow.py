@@ -43,9 +43,6 @@ from sonofix.track.inputs import gather
 DEFAULT_MAX_SPEED_MPS = 3.0
 """Of a vehicle whose site file states none."""
 
-THERMOMETER_SD_K = 1.0
-"""What a computed sound speed rests on; a stated `sound_speed_mps` is taken as it is."""
-
 
 def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
     """Run a recording through the whole street.
@@ -269,7 +266,7 @@ class Receiver:
         self.site = site
         self.waveforms = waveforms
         self.sound_speed_mps = site.sound_speed_mps
-        self.sound_speed_sd_mps = 0.0 if site.air.sound_speed_mps is not None else 0.607 * THERMOMETER_SD_K
+        self.sound_speed_sd_mps = site.sound_speed_sd_mps
         self._on_hearing = on_hearing
         self._microphones = [m for m in site.microphones if m.channel is not None]
         if not self._microphones:

@@ -371,6 +371,11 @@ class Site(_Section):
         return air.sound_speed_mps(self.air.temperature_c, self.air.humidity, self.air.pressure_kpa)
 
     @property
+    def sound_speed_sd_mps(self) -> float:
+        """Its deviation: a stated speed is taken as it is, a computed one rests on a thermometer."""
+        return 0.0 if self.air.sound_speed_mps is not None else air.BY_KELVIN_MPS * air.THERMOMETER_SD_K
+
+    @property
     def clock_known(self) -> bool:
         """Whether the moments of sending are known on the recorder's clock, so that ranges are not just differences.
 

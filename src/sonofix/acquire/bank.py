@@ -20,7 +20,7 @@ LOSS_DB = 1.0
 """Of correlation power at the edge of a velocity cell, at worst."""
 
 MOST_KEPT = 3
-"""Transform lengths whose spectra are kept: of a cold search, of a warm one, and of one for the clock or cut short."""
+"""Transform lengths whose spectra are kept: of a whole search, of one for the clock, and of one cut short."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -147,13 +147,14 @@ def taken_apart(
     everywhere: bool = True,
 ) -> Iterator[Separation]:
     """Do the work of `acquire` and yield it, band by band; ``watch`` is told each step of it."""
+    unrecorded = missing_runs(samples, plan.sample_rate_hz)
     for band, banks in plan.bands:
         baseband, start_s = downconvert(samples, first_sample, band)
         if not len(baseband):
             continue
         tones = find_tones(baseband, band.rate_hz)
         missing = np.zeros(len(baseband), bool)
-        for begin, end in missing_runs(samples, plan.sample_rate_hz):
+        for begin, end in unrecorded:
             # an output of the filter rests on as many samples as it has taps
             missing[max(0, (begin - len(band.taps)) // band.decimation + 1) : end // band.decimation + 1] = True
         job = Separation(

@@ -73,8 +73,9 @@ def task_of(path: Path, walls: Path | None, vehicle: str | None, height_m: float
     """
     import numpy as np
 
+    from sonofix.air import BY_KELVIN_MPS, THERMOMETER_SD_K
     from sonofix.files.floor_plan import read_walls
-    from sonofix.flow import DEFAULT_MAX_SPEED_MPS, THERMOMETER_SD_K
+    from sonofix.flow import DEFAULT_MAX_SPEED_MPS
     from sonofix.plan.quality import Terms, nodes_of
     from sonofix.records import Walls
 
@@ -92,7 +93,7 @@ def task_of(path: Path, walls: Path | None, vehicle: str | None, height_m: float
     level_m, free = _level(site, vehicle, height_m)
     terms = Terms(
         sound_speed_mps=site.sound_speed_mps,
-        speed_sd=0.0 if exact else 0.607 * kelvin / site.sound_speed_mps,
+        speed_sd=0.0 if exact else BY_KELVIN_MPS * kelvin / site.sound_speed_mps,
         free_level=free,
         clock=not site.clock_known,
         budget=budget,

@@ -14,7 +14,7 @@ from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.recording import read_references
 from sonofix.files.site_file import FILE_NAME, read_site, site_text
 from sonofix.files.tables import LAYOUTS, read_table
-from sonofix.files.writing import told
+from sonofix.files.writing import results_folder, told
 from sonofix.records import Calibration, Recording, ReferenceBurst
 from sonofix.site import Beacon, ReferenceCode, Site
 
@@ -135,14 +135,7 @@ def write_calibration(out: str | Path, site: Site, calibration: Calibration) -> 
     RecordingError
         Where the folder is a recording itself, or cannot be written to.
     """
-    out = Path(out)
-    if (out / FILE_NAME).exists():
-        remedy = "is a recording, whose own files might be overwritten; write to another folder with -o"
-        raise RecordingError([Problem(str(out), "", None, remedy)])
-    if out.exists() and not out.is_dir():
-        raise RecordingError([Problem(str(out), "", None, "is a file; give a folder with -o")])
-    with told(out, ""):
-        out.mkdir(parents=True, exist_ok=True)
+    out = results_folder(out)
     stem = safe_name(calibration.beacon)
     paths = [out / reference_name(calibration), out / f"{stem}.toml", out / f"{stem}.csv"]
     parts = [path.with_name(f"{path.name}.part") for path in paths]

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sonofix.files.problem import Problem, RecordingError
-from sonofix.files.site_file import FILE_NAME, site_text
-from sonofix.files.writing import told
+from sonofix.files.site_file import site_text
+from sonofix.files.writing import results_folder, told, write_text
 from sonofix.records import Floats, Quality
 from sonofix.site import Site
 
@@ -33,30 +32,18 @@ def write_plan(out: str | Path, quality: Quality, improved: Site | None = None) 
     RecordingError
         Where the folder is a recording itself, or cannot be written to.
     """
-    out = Path(out)
-    if (out / FILE_NAME).exists():
-        remedy = "is a recording, whose own files might be overwritten; write to another folder with -o"
-        raise RecordingError([Problem(str(out), "", None, remedy)])
-    if out.exists() and not out.is_dir():
-        raise RecordingError([Problem(str(out), "", None, "is a file; give a folder with -o")])
-    with told(out, ""):
-        out.mkdir(parents=True, exist_ok=True)
+    out = results_folder(out)
     texts: Mapping[str, str | None] = {
         "plan.csv": plan_text(quality),
         "improved.toml": None if improved is None else site_text(improved),
     }
     written = []
     for name, text in texts.items():
-        part = out / f"{name}.part"
-        with told(out, name):
-            if text is None:
+        if text is None:
+            with told(out, name):
                 (out / name).unlink(missing_ok=True)
-                continue
-            try:
-                part.write_text(text, encoding="utf-8")
-                part.replace(out / name)
-            finally:
-                part.unlink(missing_ok=True)
+            continue
+        write_text(out / name, text)
         written.append(out / name)
     return written
 

@@ -14,7 +14,7 @@ from sonofix.files.audio import CAPTURE_NAMES
 from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.site_file import FILE_NAME, parse_site, site_text
 from sonofix.files.tables import LAYOUTS
-from sonofix.files.writing import told
+from sonofix.files.writing import told, write_text, write_whole
 from sonofix.records import Survey
 from sonofix.site import Beacon, Microphone, ReferenceCode, Site
 
@@ -176,7 +176,7 @@ def write_site(path: str | Path, text: str) -> None:
     RecordingError
         Where it cannot be written.
     """
-    _write(Path(path), text)
+    write_text(Path(path), text)
 
 
 def write_survey(path: str | Path, found: Survey) -> None:
@@ -187,7 +187,7 @@ def write_survey(path: str | Path, found: Survey) -> None:
     RecordingError
         Where it cannot be written.
     """
-    _write(Path(path), json.dumps(survey_values(found), indent=1, allow_nan=False) + "\n")
+    write_text(Path(path), json.dumps(survey_values(found), indent=1, allow_nan=False) + "\n")
 
 
 def survey_values(found: Survey) -> dict[str, Any]:
@@ -251,19 +251,4 @@ def write_picture(path: str | Path, save: Callable[[Path], None]) -> None:
     RecordingError
         Where it cannot be written.
     """
-    _made(Path(path), save)
-
-
-def _write(path: Path, text: str) -> None:
-    _made(path, lambda part: part.write_text(text, encoding="utf-8"))
-
-
-def _made(path: Path, make: Callable[[Path], object]) -> None:
-    with told(path.parent, path.name):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f"{path.name}.part")
-        try:
-            make(part)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+    write_whole(Path(path), save)

@@ -6,7 +6,7 @@ import csv
 import heapq
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -203,6 +203,48 @@ class _RowFile:
         """Close the file whatever may come of it."""
         with suppress(OSError):
             self._file.close()
+
+
+def results_folder(out: str | Path) -> Path:
+    """Make the folder that a command's results go to.
+
+    Raises
+    ------
+    RecordingError
+        Where it is a recording itself, or a file, or cannot be made.
+    """
+    out = Path(out)
+    if (out / "site.toml").exists():
+        remedy = "is a recording, whose own files might be overwritten; write to another folder with -o"
+        raise RecordingError([Problem(str(out), "", None, remedy)])
+    if out.exists() and not out.is_dir():
+        raise RecordingError([Problem(str(out), "", None, "is a file; give a folder with -o")])
+    with told(out, ""):
+        out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def write_whole(path: Path, make: Callable[[Path], object]) -> None:
+    """Let ``make`` write a file under another name, then give it its own: it is there whole or not at all.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    """
+    with told(path.parent, path.name):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f"{path.name}.part")
+        try:
+            make(part)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file by `write_whole`."""
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 @contextmanager

@@ -27,6 +27,19 @@ def factor(a):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def substitute(lower, x):
+    """Solve L Lᵀ y = x in place, L (n, n) as `factor` leaves it."""
+    for j in range(len(x)):
+        for k in range(j):
+            x[j] -= lower[j, k] * x[k]
+        x[j] /= lower[j, j]
+    for j in range(len(x) - 1, -1, -1):
+        for k in range(j + 1, len(x)):
+            x[j] -= lower[k, j] * x[k]
+        x[j] /= lower[j, j]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def whitener(covariance, out):
     """Lower triangular ``out`` with out · covariance · outᵀ = 1; False where the covariance is not positive."""
     n = len(covariance)

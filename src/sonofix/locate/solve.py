@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from sonofix.geometry import expected
-from sonofix.locate.dense import factor
+from sonofix.locate.dense import factor, substitute
 
 SAME = 1e-3
 """A descent that comes within so many metres and radians of where an earlier one came to rest ends there."""
@@ -94,14 +94,7 @@ def descend(rows, c, clock, whiten, index, known, iterations, state, plain, miss
             normal[j, j] += damping
         downhill = factor(normal)
         if downhill:
-            for j in range(count):
-                for k in range(j):
-                    step[j] -= normal[j, k] * step[k]
-                step[j] /= normal[j, j]
-            for j in range(count - 1, -1, -1):
-                for k in range(j + 1, count):
-                    step[j] -= normal[k, j] * step[k]
-                step[j] /= normal[j, j]
+            substitute(normal, step)
             for j in range(10):
                 tried[j] = state[j]
             for j in range(count):

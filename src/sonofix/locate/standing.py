@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.locate.dense import factor, spread, whitener
+from sonofix.locate.dense import factor, spread, substitute, whitener
 from sonofix.locate.search import STEPS, mirror
 from sonofix.locate.start import MOST_STARTS, begin
 
@@ -93,14 +93,7 @@ def descend(anchors, measured, whiten, index, known, state, work):
             normal[j, j] += damping
         downhill, new_chi2 = factor(normal), np.inf
         if downhill:
-            for j in range(count):
-                for k in range(j):
-                    step[j] -= normal[j, k] * step[k]
-                step[j] /= normal[j, j]
-            for j in range(count - 1, -1, -1):
-                for k in range(j + 1, count):
-                    step[j] -= normal[k, j] * step[k]
-                step[j] /= normal[j, j]
+            substitute(normal, step)
             for j in range(4):
                 tried[j] = state[j]
             for j in range(count):

@@ -28,9 +28,6 @@ RING_S = 15e-3
 MOST_KEPT = 6_000_000
 """Values of all bursts together that are held in memory, 8 bytes each."""
 
-THERMOMETER_SD_K = 1.0
-"""Doubt about a temperature that a site file states, as in `flow`."""
-
 
 def calibrate(
     recording: Recording,
@@ -144,7 +141,7 @@ def calibrate(
         length_s=length_s,
         distance_m=distance_m,
         distance_sd_m=distance_sd_m,
-        sound_speed_sd_mps=0.0 if site.air.sound_speed_mps is not None else 0.607 * THERMOMETER_SD_K,
+        sound_speed_sd_mps=site.sound_speed_sd_mps,
         lead_s=LEAD_S,
         gate_s=gate_s,
     )

@@ -13,6 +13,7 @@ from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
 from sonofix.track import steps, wheels
+from sonofix.track.anchor import lift
 from sonofix.track.inputs import STEP, WHEELS, Inputs
 
 SIZE = len(POSE)
@@ -191,8 +192,8 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
         covariance[-1, -1] = (CLOCK_SPEED_SD * SOUND_SPEED_MPS) ** 2
         free[clock] = True
     if belief.inputs is not None:
-        steps.lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]))
-        wheels.lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]))
+        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
+        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
     index = [names[state] for state in fix.states]
     covariance[np.ix_(index, index)] = fix.covariance
     free[index] = True
@@ -232,8 +233,8 @@ def reopen(belief: Belief, vehicle: int, far_m: float) -> Belief:
     for i, sd in ((0, far_m), (1, far_m), (4, 1.0), (5, 1.0)):
         covariance[SIZE * vehicle + i, SIZE * vehicle + i] += sd**2
     if belief.inputs is not None:
-        steps.lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]))
-        wheels.lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]))
+        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
+        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
     return replace(belief, mean=mean, covariance=covariance, free=free)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import POSE
 from sonofix.records import Floats
+from sonofix.track.anchor import correct, stir
 
 LENGTH_SD = 0.05 / 0.6
 """Of the slow error of step length, as a share of it: 5 cm of a step of 60 cm."""
@@ -39,23 +40,12 @@ def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
         free[i] = True
 
 
-def lift(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
-    """Take the anchor away, in place: where the step before ended is not known on this track. ``slot`` −1: nothing."""
-    if slot < 0:
-        return
-    own = slice(slot, slot + 2)
-    mean[own] = 0.0
-    covariance[own, :] = covariance[:, own] = 0.0
-    free[own] = False
-
-
 def wander(mean: Floats, covariance: Floats, vehicle: int, slot: int, dt: float, placed: bool) -> None:
     """Let a walker's step errors age by ``dt`` in place, and his velocity be as free as a walker's.
 
     The errors fade towards zero with `CORRELATED_S` while noise keeps their variance (Gelb 1974, section 3.7).
     """
-    span = abs(dt)
-    fade = float(np.exp(-span / CORRELATED_S))
+    fade = float(np.exp(-abs(dt) / CORRELATED_S))
     for i, sd in ((slot + 2, LENGTH_SD), (slot + 3, HEADING_SD_RAD)):
         mean[i] *= fade
         covariance[i, :] *= fade
@@ -64,10 +54,7 @@ def wander(mean: Floats, covariance: Floats, vehicle: int, slot: int, dt: float,
     if not placed:
         return
     for at in (len(POSE) * vehicle, len(POSE) * vehicle + 1):
-        covariance[at, at] += AGILE_PSD * span**3 / 3
-        covariance[at, at + 4] += AGILE_PSD * dt * span / 2
-        covariance[at + 4, at] += AGILE_PSD * dt * span / 2
-        covariance[at + 4, at + 4] += AGILE_PSD * span
+        stir(covariance, at, AGILE_PSD, dt)
 
 
 def take(
@@ -93,10 +80,9 @@ def take(
 
 
 def _correct(mean: Floats, covariance: Floats, vehicle: int, slot: int, length_m: float, heading_rad: float) -> None:
-    """Correct a belief by one step, in place: an extended Kalman update in Joseph form.
+    """Correct a belief by one step, in place.
 
-    With a the anchor and k and ψ the errors of length and heading, p − a = (1 − k) L u(h − ψ). A step that is not
-    likely at all is left out.
+    With a the anchor and k and ψ the errors of length and heading, p − a = (1 − k) L u(h − ψ).
     """
     at = len(POSE) * vehicle
     length = length_m * (1.0 - mean[slot + 2])
@@ -108,13 +94,4 @@ def _correct(mean: Floats, covariance: Floats, vehicle: int, slot: int, length_m
     derivative[0, slot] = derivative[1, slot + 1] = -1.0
     derivative[:, slot + 2] = length_m * along
     derivative[:, slot + 3] = length * across
-    crossed = derivative @ covariance
-    noise = STEP_SD_M**2 * np.eye(2)
-    expected = crossed @ derivative.T + noise
-    gain = np.linalg.solve(expected, crossed).T
-    if miss @ np.linalg.solve(expected, miss) > UNLIKELY:
-        return
-    keep = np.eye(len(mean)) - gain @ derivative
-    after = keep @ covariance @ keep.T + gain @ noise @ gain.T
-    mean += gain @ miss
-    covariance[:] = (after + after.T) / 2
+    correct(mean, covariance, miss, derivative, STEP_SD_M**2 * np.eye(2), UNLIKELY)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import POSE
 from sonofix.records import Floats
+from sonofix.track.anchor import correct, stir
 
 SCALE_SD = 0.05
 """Of the share of itself by which a speed is told too high; it stays what it is."""
@@ -76,20 +77,7 @@ def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int,
     covariance[slot + 4, slot + 4] += BIAS_PSD * span
     at = len(POSE) * vehicle + 3
     if free[at]:
-        covariance[at, at] += AGILE_TURN_PSD * span**3 / 3
-        covariance[at, at + 4] += AGILE_TURN_PSD * dt * span / 2
-        covariance[at + 4, at] += AGILE_TURN_PSD * dt * span / 2
-        covariance[at + 4, at + 4] += AGILE_TURN_PSD * span
-
-
-def lift(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
-    """Take the anchor away, in place. ``slot`` −1: nothing."""
-    if slot < 0:
-        return
-    own = slice(slot, slot + 3)
-    mean[own] = 0.0
-    covariance[own, :] = covariance[:, own] = 0.0
-    free[own] = False
+        stir(covariance, at, AGILE_TURN_PSD, dt)
 
 
 def take(
@@ -123,7 +111,7 @@ def take(
 def _correct(
     mean: Floats, covariance: Floats, vehicle: int, slot: int, arc: tuple[float, float, float], arm: Floats
 ) -> None:
-    """Correct a belief by one arc, in place: an extended Kalman update in Joseph form.
+    """Correct a belief by one arc, in place.
 
     With a and α the anchor's place and heading, k and b the errors of way and yaw rate, and ω = turn − b dt: ψ = α + ω,
     p − a = (1 − k) way sinc(ω/2) u(α + ω/2) + (R(ψ) − R(α)) arm.
@@ -155,19 +143,7 @@ def _correct(
     derivative[2, slot + 4] = dt
     place = CREEP_PSD * dt + SLIP_M * abs(way)
     heading = TWIST_PSD * dt + TWIST_M * abs(way) + TWIST_RAD * abs(turn)
-    _update(mean, covariance, miss, derivative, np.diag([place, place, heading]), UNLIKELY)
-
-
-def _update(mean: Floats, covariance: Floats, miss: Floats, derivative: Floats, noise: Floats, unlikely: float) -> None:
-    crossed = derivative @ covariance
-    expected = crossed @ derivative.T + noise
-    if miss @ np.linalg.solve(expected, miss) > unlikely:
-        return
-    gain = np.linalg.solve(expected, crossed).T
-    keep = np.eye(len(mean)) - gain @ derivative
-    after = keep @ covariance @ keep.T + gain @ noise @ gain.T
-    mean += gain @ miss
-    covariance[:] = (after + after.T) / 2
+    correct(mean, covariance, miss, derivative, np.diag([place, place, heading]), UNLIKELY)
 
 
 def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, heading_rad: float) -> None:
@@ -183,7 +159,7 @@ def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: in
     derivative[0, at] = 1.0
     off = abs(miss) / np.sqrt(covariance[at, at] + COMPASS_SD_RAD**2)
     noise = COMPASS_SD_RAD**2 * max(1.0, off / ROBUST)
-    _update(mean, covariance, np.array([miss]), derivative, np.array([[noise]]), np.inf)
+    correct(mean, covariance, np.array([miss]), derivative, np.array([[noise]]), np.inf)
 
 
 def open_heading(

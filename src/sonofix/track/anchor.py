@@ -1,0 +1,46 @@
+"""What steps and odometry share: an anchor where the last row ended, its correction, and freer motion between rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Floats
+
+
+def lift(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, size: int) -> None:
+    """Take an anchor of ``size`` states away, in place: it is not known on this track. ``slot`` −1: nothing."""
+    if slot < 0:
+        return
+    own = slice(slot, slot + size)
+    mean[own] = 0.0
+    covariance[own, :] = covariance[:, own] = 0.0
+    free[own] = False
+
+
+def stir(covariance: Floats, at: int, density: float, dt: float) -> None:
+    """Let state ``at``, whose rate stands 4 behind, be disturbed for ``dt``, in place, by white acceleration.
+
+    Bar-Shalom 2001, eq 6.2.2-12.
+    """
+    span = abs(dt)
+    covariance[at, at] += density * span**3 / 3
+    covariance[at, at + 4] += density * dt * span / 2
+    covariance[at + 4, at] += density * dt * span / 2
+    covariance[at + 4, at + 4] += density * span
+
+
+def correct(mean: Floats, covariance: Floats, miss: Floats, derivative: Floats, noise: Floats, unlikely: float) -> None:
+    """Correct a belief in place: an extended Kalman update in Joseph form.
+
+    What misses by more than ``unlikely``, squared and over its variance, is left out.
+    """
+    crossed = derivative @ covariance
+    expected = crossed @ derivative.T + noise
+    if miss @ np.linalg.solve(expected, miss) > unlikely:
+        return
+    gain = np.linalg.solve(expected, crossed).T
+    keep = np.eye(len(mean)) - gain @ derivative
+    after = keep @ covariance @ keep.T + gain @ noise @ gain.T
+    mean += gain @ miss
+    covariance[:] = (after + after.T) / 2
