@@ -20,6 +20,31 @@ class Stopped(KeyboardInterrupt):
     """Ctrl-C after the outputs were closed; the message says what was kept."""
 
 
+_asked_to_stop: list[int] = []
+
+
+def heed_ctrl_c() -> None:
+    """Remember Ctrl-C as well as raise it: loops that are just being compiled lose the exception on its way."""
+    import signal
+
+    def stop(number: int, _frame: object) -> None:
+        _asked_to_stop.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, stop)
+
+
+def stop_if_asked() -> None:
+    """Raise a Ctrl-C that was lost.
+
+    Raises
+    ------
+    KeyboardInterrupt
+    """
+    if _asked_to_stop:
+        raise KeyboardInterrupt
+
+
 def speaker() -> Console:
     """Return a console on stdout that prints text as it is."""
     from rich.console import Console

@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 from sonofix.cli.calibrate import calibrate
 from sonofix.cli.check import check
 from sonofix.cli.codes import codes
-from sonofix.cli.console import Stopped
+from sonofix.cli.console import Stopped, heed_ctrl_c
 from sonofix.cli.demo import demo
 from sonofix.cli.explain import explain
 from sonofix.cli.plan import plan
@@ -111,4 +111,5 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
+    heed_ctrl_c()
     app()

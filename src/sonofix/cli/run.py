@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import Stopped, counted, drawing, print_table, progress_bar, speaker, watched
+from sonofix.cli.console import Stopped, counted, drawing, print_table, progress_bar, speaker, stop_if_asked, watched
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -87,6 +87,7 @@ def _seen(steps: Iterator[Step], *watchers: Callable[[Step], None]) -> Iterator[
         yield step
         for watcher in watchers:
             watcher(step)
+        stop_if_asked()
 
 
 class _Sample:
