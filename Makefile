@@ -33,7 +33,7 @@ format: $(STAMP)
 
 lock:  ## renew requirements.lock (needs uv)
 	uv pip compile --quiet --universal --python-version 3.11 --no-header --no-annotate --no-emit-index-url \
-	  --no-emit-find-links --generate-hashes --all-extras --group dev pyproject.toml -o requirements.lock
+	  --no-emit-find-links --generate-hashes --all-extras --group dev --group peers pyproject.toml -o requirements.lock
 
 $(STAMP): pyproject.toml requirements.lock
 	@if command -v uv >/dev/null 2>&1; then \
