@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
 import platform
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -58,6 +62,39 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> 
     print("|" + "---|" * len(columns))
     for row in rows:
         print("| " + " | ".join(row) + " |", flush=True)
+
+
+@contextmanager
+def renew(page: Path | None, program: str) -> Iterator[None]:
+    """Show what is printed and, where a page is given, put it between that program's marks there once all is done.
+
+    Raises
+    ------
+    ValueError
+        If the page lacks the marks; before anything is printed.
+    """
+    begin, end = f"<!-- printed by {program} -->\n", f"<!-- end of {program} -->"
+    if page is not None and (begin not in page.read_text("utf-8") or end not in page.read_text("utf-8")):
+        raise ValueError(f"{page}: has no lines {begin.strip()!r} and {end!r}; add them where the tables belong")
+    both = _Both()
+    with redirect_stdout(both):
+        yield
+    if page is not None:
+        before, rest = page.read_text("utf-8").split(begin, 1)
+        page.write_text(before + begin + both.getvalue().lstrip("\n") + end + rest.split(end, 1)[1], "utf-8")
+
+
+class _Both(io.StringIO):
+    """What is printed, kept and shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._screen = sys.stdout
+
+    def write(self, text: str) -> int:
+        self._screen.write(text)
+        self._screen.flush()
+        return super().write(text)
 
 
 def milliseconds(seconds: float) -> str:

@@ -1,0 +1,89 @@
+"""A track as a TUM trajectory and as a Parquet table."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from sonofix.files.results import column
+from sonofix.files.writing import write_whole
+from sonofix.records import Floats, Table
+
+NO_PARQUET = "writing Parquet needs pyarrow; pip install 'sonofix[parquet]'"
+
+
+def quaternions(track: Table) -> Floats:
+    """Return attitudes as quaternions x, y, z, w, (n, 4), of ZYX angles; an angle that is not known counts as 0."""
+    half = [0.5 * np.nan_to_num(column(track, name), nan=0.0) for name in ("roll_rad", "pitch_rad", "yaw_rad")]
+    (cr, cp, cy), (sr, sp, sy) = (tuple(turn(angle) for angle in half) for turn in (np.cos, np.sin))
+    return np.column_stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def positions(track: Table) -> Floats:
+    """Return positions, (n, 3); NaN where they are not known."""
+    return np.column_stack([track.columns[f"{axis}_m"] for axis in "xyz"])
+
+
+def write_tum(path: Path, track: Table) -> int:
+    """Write one vehicle's track as `time x y z qx qy qz qw`; return the number of rows.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    """
+    rows = np.flatnonzero(np.isfinite(positions(track)).all(axis=1))
+    numbers = np.column_stack([track.columns["time_s"], positions(track), quaternions(track)])[rows]
+
+    def make(part: Path) -> None:
+        with part.open("w", newline="", encoding="utf-8") as file:
+            lines = csv.writer(file, delimiter=" ", lineterminator="\n")
+            for row in numbers.tolist():
+                lines.writerow(
+                    [f"{value:.{digits}f}" for value, digits in zip(row, (9, 6, 6, 6, 9, 9, 9, 9), strict=True)]
+                )
+
+    write_whole(path, make)
+    return len(rows)
+
+
+def write_parquet(path: Path, track: Table, zero_ns: int | None) -> int:
+    """Write a track with all its columns, null where a cell is empty; return the number of rows.
+
+    The file's metadata hold the instant of time 0, where it is known, as `sonofix.zero_ns`.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    ValueError
+        If pyarrow is not installed.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("pyarrow"):
+            raise
+        raise ValueError(NO_PARQUET) from None
+    arrays = {"time_s": pa.array(track.columns["time_s"])}
+    arrays |= {name: pa.array(texts).dictionary_encode() for name, texts in track.names.items() if name == "vehicle"}
+    for name, values in track.columns.items():
+        arrays.setdefault(name, pa.array(values, mask=np.isnan(values)))
+    for name, texts in track.names.items():
+        arrays.setdefault(name, pa.array(texts).dictionary_encode())
+    meta = {"sonofix.frame": "east, north, up; SI units; angles counter-clockwise from the x axis"}
+    if zero_ns is not None:
+        meta["sonofix.zero_ns"] = str(zero_ns)
+    table = pa.table(arrays).replace_schema_metadata(meta)
+    write_whole(path, lambda part: pq.write_table(table, part))
+    return table.num_rows
