@@ -858,3 +858,71 @@ class Survey:
     rate_after_mps: float
     inflation: float
     events: tuple[Event, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """A line or a cloud of points in a study's panel; NaN in ``y`` breaks it.
+
+    ``kind`` says what it shows: "truth", "raw" (single measurements), "alone" (what one sensor does without help),
+    "result" (what an estimator makes of all) or "bound" (a claim, a limit).
+    """
+
+    name: str
+    x: Floats
+    y: Floats
+    kind: Literal["truth", "raw", "alone", "result", "bound"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One diagram of a study; ``note`` stands beside its title.
+
+    ``y_limits`` None: as the curves need; ``blind``: spans of x in which beacons were silent.
+    """
+
+    title: str
+    note: str
+    x_label: str
+    y_label: str
+    curves: tuple[Curve, ...]
+    y_limits: tuple[float, float] | None = None
+    logarithmic: bool = False
+    blind: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """One figure that a study found.
+
+    Attributes
+    ----------
+    case, quantity : str
+        What was run, and what was measured on it.
+    value : float
+    sd : float or None
+        Its standard error over the runs; None where one run tells none.
+    unit : "m", "m/s" or "" (a share)
+    runs : int
+    claim : str
+        What the seed says of it, or what it should be; empty where neither.
+    """
+
+    case: str
+    quantity: str
+    value: float
+    sd: float | None
+    unit: str
+    runs: int
+    claim: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sheet:
+    """What a study shows: ``panels`` row by row, so many ``columns``, and the figures found."""
+
+    title: str
+    note: str
+    columns: int
+    panels: tuple[Panel, ...]
+    findings: tuple[Finding, ...]

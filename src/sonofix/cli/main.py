@@ -15,10 +15,13 @@ from sonofix.cli.codes import codes
 from sonofix.cli.console import Stopped, heed_ctrl_c
 from sonofix.cli.demo import demo
 from sonofix.cli.explain import explain
+from sonofix.cli.export import export
+from sonofix.cli.import_bag import import_bag
 from sonofix.cli.plan import plan
 from sonofix.cli.run import run
 from sonofix.cli.score import score
 from sonofix.cli.simulate import simulate
+from sonofix.cli.study import study
 from sonofix.cli.survey import survey
 
 MISUSE = 2
@@ -101,8 +104,9 @@ def sonofix(
     """Positioning by sound: from microphone samples to a fused track."""
 
 
-for command in (run, check, simulate, score, explain, codes, plan, calibrate, survey, demo):
+for command in (run, check, simulate, score, explain, codes, plan, calibrate, survey, study, export, demo):
     app.command()(command)
+app.command("import")(import_bag)
 
 
 def main() -> None:

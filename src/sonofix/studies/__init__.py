@@ -1,0 +1,42 @@
+"""The seeds' simulations, a file a seed: what each claims on its own numbers, and the same through our receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+
+from sonofix.studies.work import Work
+
+STUDIES = {
+    "quasi-gps": "an automatic vehicle: coarse fixes and velocities, and the four-state filter",
+    "pedestrian": "a walker: differences of arrival times, dead reckoning by steps, and the error-state filter",
+}
+"""Names of the studies and what they are about. Each has a module of its name with a `study` of its own."""
+
+
+def begin(name: str, runs: int, seed: int, waveforms: int) -> Work:
+    """Set a study up; nothing is computed yet.
+
+    Parameters
+    ----------
+    name : str
+        A key of `STUDIES`.
+    runs : int
+        Of the simulation on the seed's numbers, 1 or more.
+    seed : int
+        Same seed, same numbers: run k is the same however many there are.
+    waveforms : int
+        Runs from waveforms through the receiver, 0 or more.
+
+    Raises
+    ------
+    ValueError
+        For another name, or counts out of reach.
+    """
+    if name not in STUDIES:
+        raise ValueError(f"study {name}: there is none of that name; there are {', '.join(STUDIES)}")
+    for what, value, least in (("runs", runs, 1), ("seed", seed, 0), ("waveforms", waveforms, 0)):
+        if value < least:
+            raise ValueError(f"{what} {value}: it must be {least} or more")
+    study: Callable[[int, int, int], Work] = import_module(f"sonofix.studies.{name.replace('-', '_')}").study
+    return study(runs, seed, waveforms)
