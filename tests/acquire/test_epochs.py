@@ -96,6 +96,30 @@ def test_a_free_running_beacon_is_followed(drift: float) -> None:
     assert len(epochs) >= 29
 
 
+def test_a_false_burst_while_seeking_does_not_move_the_epochs() -> None:
+    schedule = Schedule(PERIOD_S, REACH_S, None, known=False, regular=True)
+    schedule.found(np.array([0.094, 0.103, 0.112, 0.495]))
+    window = schedule.window()
+    assert window is not None
+    assert window.opens_s == pytest.approx(0.094 - REACH_S)
+
+
+def test_what_was_none_of_the_bursts_is_sought_anew() -> None:
+    schedule = Schedule(PERIOD_S, REACH_S, None, known=False, regular=True)
+    schedule.found(np.array([0.495]))
+    for _ in range(3):
+        window = schedule.window()
+        assert window is not None
+        if window.seeking:
+            schedule.found(np.array([0.094, 0.103, 0.112]) + PERIOD_S * np.ceil((window.opens_s - 0.094) / PERIOD_S))
+            break
+        schedule.done(np.zeros(0))
+    window = schedule.window()
+    assert window is not None
+    assert (window.opens_s + REACH_S - 0.094) % PERIOD_S == pytest.approx(0.0, abs=1e-9)
+    assert window.sync_s == pytest.approx(window.opens_s)
+
+
 @pytest.mark.parametrize("regular", [True, False])
 def test_silence_at_the_start_is_waited_through(regular: bool) -> None:
     bursts_s = np.sort((np.arange(4, 12)[:, None] * PERIOD_S + 0.3 + np.array([0.004, 0.011, 0.023])).ravel())

@@ -91,6 +91,7 @@ class Schedule:
         self._reach_s = min(reach, period_s) if known else min(reach, period_s / 2)
         self._index = 0
         self._seek_s = 0.0
+        self._found = False
         self._first_s: float | None = None
         self._base_s = 0.0
 
@@ -112,26 +113,38 @@ class Schedule:
         return Window(self._index, sync_s, opens_s, closes_s)
 
     def found(self, starts_s: Floats) -> None:
-        """Tell when the bursts of the seeking window were heard to begin: they cluster, modulo the period."""
+        """Tell when the bursts of the seeking window were heard to begin: they cluster, modulo the period.
+
+        Those of one epoch lie within the longest flight of each other; the first of the most that do begins it.
+        """
         if not len(starts_s):
             self._seek_s += self._period_s
             return
         order = np.sort(starts_s)
-        gaps = np.diff(np.append(order, order[0] + self._period_s))
-        after = (int(np.argmax(gaps)) + 1) % len(order)
-        first_s = float(order[after])
+        behind = (order[None, :] - order[:, None]) % self._period_s
+        followers = np.count_nonzero(behind <= self._reach_s, axis=1)
+        # of as many, the one after the longest silence
+        silence = np.diff(order, prepend=order[-1] - self._period_s)
+        first_s = float(order[np.lexsort((silence, followers))[-1]])
         if self._seek_s == 0.0:
             # the window may have opened amid the bursts of an epoch: begin with the first that is whole
             first_s = float((first_s - START_GUARD_S) % self._period_s + START_GUARD_S)
         self._first_s = first_s
-        self._base_s = self._first_s - self._reach_s
+        self._base_s = self._first_s - self._reach_s - self._index * self._period_s
 
     def done(self, starts_s: Floats) -> None:
         """Tell when the bursts of the last window were heard to begin, and go on to the next."""
         self._index += 1
-        if self._first_s is not None:
-            heard = float(np.min(starts_s)) if len(starts_s) else self._first_s
-            self._first_s = heard + self._period_s
+        if self._first_s is None:
+            return
+        if len(starts_s):
+            self._found = True
+            self._first_s = float(np.min(starts_s))
+        elif not self._found:
+            # what the seeking window held was none of the bursts
+            self._first_s, self._seek_s = None, self._first_s + self._reach_s
+            return
+        self._first_s += self._period_s
 
 
 def screen(samples: NDArray[np.float32], rate_hz: float) -> tuple[NDArray[np.float32], tuple[str, ...]]:
