@@ -109,6 +109,10 @@ class Follower:
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
+    def time_of(self, epoch: RangeEpoch) -> float:
+        """Return the instant an epoch's state will belong to."""
+        return self._time(epoch, link(self.site, epoch.emitter, epoch.receiver))
+
     def _time(self, epoch: RangeEpoch, links: Links) -> float:
         """Instant the epoch's state belongs to; an empty epoch takes the delay that others showed."""
         if not len(epoch):
