@@ -55,9 +55,7 @@ def copied(belief: Belief) -> Belief:
     order = np.concatenate([np.arange(n - CLOCK), index, np.arange(n - CLOCK, n)])
     free = belief.free[order]
     free[n - CLOCK : n - CLOCK + len(index)] = False
-    return replace(
-        belief, mean=belief.mean[order], covariance=belief.covariance[np.ix_(order, order)], free=free
-    )
+    return replace(belief, mean=belief.mean[order], covariance=belief.covariance[np.ix_(order, order)], free=free)
 
 
 def parted(belief: Belief, count: int) -> tuple[Belief, Floats, Floats, Floats]:
@@ -72,9 +70,7 @@ def parted(belief: Belief, count: int) -> tuple[Belief, Floats, Floats, Floats]:
     n = len(belief.mean)
     own = np.concatenate([np.arange(n - CLOCK - count), np.arange(n - CLOCK, n)])
     old = np.arange(n - CLOCK - count, n - CLOCK)
-    kept = replace(
-        belief, mean=belief.mean[own], covariance=belief.covariance[np.ix_(own, own)], free=belief.free[own]
-    )
+    kept = replace(belief, mean=belief.mean[own], covariance=belief.covariance[np.ix_(own, own)], free=belief.free[own])
     return kept, belief.mean[old], belief.covariance[np.ix_(old, old)], belief.covariance[np.ix_(old, own)]
 
 

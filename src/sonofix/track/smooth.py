@@ -11,13 +11,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sonofix.geometry import POSE
-from sonofix.records import Estimate, Fix, Floats, RangeEpoch
+from sonofix.geometry import POSE, link
+from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.track.belief import SIZE, Belief, Nominal, estimate, predict
 from sonofix.track.chain import Chain
 from sonofix.track.follow import Follower
 from sonofix.track.inputs import Inputs, reckoned
+from sonofix.track.update import update
 from sonofix.track.wheels import open_heading
 
 Heard = tuple[RangeEpoch, tuple[Fix, ...]]
@@ -25,11 +27,14 @@ Heard = tuple[RangeEpoch, tuple[Fix, ...]]
 
 YAW = POSE.index("yaw")
 
-PASSES = 4
+PASSES = 3
 """Most passes through a recording."""
 
 SETTLED = 0.1
 """Passes end when no state of an epoch moves by more of its own deviation."""
+
+BACK_SD_M = 1.0
+"""A track is led back to before its vehicle's first fix while its place is known better than this."""
 
 ANY_HEADING_RAD = float(np.pi / np.sqrt(3))
 """Deviation of a heading that may be any."""
@@ -86,6 +91,8 @@ class Passage:
         self.chain = Chain()
         self.marks: list[Mark] = []
         self.epochs = 0
+        self.used: list[NDArray[np.bool_]] = []
+        self.events: list[tuple[Event, ...]] = []
         self._rate_hz = rate_hz
         self._guide = guide
         self._relinearise = relinearise
@@ -102,7 +109,9 @@ class Passage:
         if self._guide is not None:
             about = Nominal(self._guide.row, self._guide.now[self.epochs])
             follower.belief = replace(follower.belief, about=about)
-        follower.step(epoch, fixes)
+        _, used, events = follower.step(epoch, fixes)
+        self.used.append(used)
+        self.events.append(events)
         for opening in self._guide.openings if self._guide is not None else ():
             if opening.epoch == self.epochs:
                 follower.belief = _opened(follower.belief, opening)
@@ -172,26 +181,131 @@ def smooth(
     list of tuple of Estimate, as long as ``heard``
         Of source "smoothed", in order of time: what falls to each epoch.
     """
-    guide, passage, done = None, Passage(begin(), rate_hz, None, passes > 1), False
-    for k in range(passes):
-        passage = Passage(begin(), rate_hz, guide, k + 1 < passes)
+    passage = settle(begin, heard, rate_hz, passes, on_epoch)
+    out: list[list[Estimate]] = [[] for _ in heard]
+    first: Belief | None = None
+    for mark, belief in passage.back():
+        first = belief
+        if mark.told:
+            out[mark.epoch][:0] = estimates(belief, passage.follower)
+    if first is not None:
+        for epoch, belief in earlier(passage, heard, first, rate_hz):
+            out[epoch] += estimates(belief, passage.follower)
+    return [tuple(some) for some in out]
+
+
+def settle(
+    begin: Callable[[], Follower],
+    heard: Sequence[Heard],
+    rate_hz: float | None,
+    passes: int,
+    on_epoch: Callable[[], None],
+) -> Passage:
+    """Pass through a recording, as `smooth` says, until the track stays where it is; return the last pass."""
+    guide: Guide | None = None
+    for left in reversed(range(passes)):
+        passage = Passage(begin(), rate_hz, guide, left > 0)
         for one in heard:
             passage.take(one)
             on_epoch()
-        if done or k + 1 == passes:
-            break
-        following = guided(passage)
+        if not left or not passage.marks:
+            return passage
+        following = guided(passage, () if guide is None else guide.openings)
         if guide is not None:
             with np.errstate(invalid="ignore"):
                 moved = np.abs(following.now - guide.now) / guide.sd
             if not np.any(moved > SETTLED):
-                break
+                return passage
         guide = following
-    out: list[list[Estimate]] = [[] for _ in heard]
-    for mark, belief in passage.back():
-        if mark.told:
-            out[mark.epoch][:0] = estimates(belief, passage.follower)
-    return [tuple(some) for some in out]
+    raise ValueError(f"passes: {passes}; at least 1 is needed")
+
+
+class FixedLag:
+    """Smooths while epochs come: each leaves once others up to ``lag_s`` later are known. One pass, bounded memory.
+
+    Parameters
+    ----------
+    follower : Follower
+        As it was before the first epoch.
+    lag_s : float
+        Infinite: all leave at the end.
+    rate_hz : float or None
+        Rows of the track a second; None: one an epoch.
+    """
+
+    def __init__(self, follower: Follower, lag_s: float, rate_hz: float | None = None) -> None:
+        self._passage = Passage(follower, rate_hz, relinearise=False)
+        self._lag_s = lag_s
+        self._left = 0
+
+    def take(self, heard: Heard) -> list[tuple[Estimate, ...]]:
+        """Follow one epoch; return what falls to each epoch that leaves now, in order."""
+        self._passage.take(heard)
+        knots = self._passage.chain.knots
+        if not knots:
+            return self._leave(self._passage.epochs, 0)
+        due_s = knots[-1].belief.time_s - self._lag_s
+        count = sum(knot.belief.time_s <= due_s for knot in knots)
+        ended = [i for i, mark in enumerate(self._passage.marks[:count]) if mark.ends]
+        if not ended:
+            return []
+        return self._leave(self._passage.marks[ended[-1]].epoch + 1, ended[-1] + 1)
+
+    def finish(self) -> list[tuple[Estimate, ...]]:
+        """Return what falls to the epochs that have not left."""
+        return self._leave(self._passage.epochs, 0)
+
+    def _leave(self, epochs: int, knots: int) -> list[tuple[Estimate, ...]]:
+        """Let epochs go, as far as those before number ``epochs``, and what lies before knot ``knots``."""
+        out: list[list[Estimate]] = [[] for _ in range(epochs - self._left)]
+        if out:
+            for mark, belief in self._passage.back():
+                if mark.told and self._left <= mark.epoch < epochs:
+                    out[mark.epoch - self._left][:0] = estimates(belief, self._passage.follower)
+        self._left = max(epochs, self._left)
+        # the last knot's copy travels on
+        self._passage.forget(min(knots, len(self._passage.marks) - 1))
+        return [tuple(some) for some in out]
+
+
+def earlier(
+    passage: Passage, heard: Sequence[Heard], first: Belief, rate_hz: float | None
+) -> Iterator[tuple[int, Belief]]:
+    """Lead a smoothed track back to epochs before its first, by ranges too few for a fix and the motion alone.
+
+    ``first`` is the smoothed belief there. What began with ranges gathered from those epochs is not led back, nor what
+    has another clock in each. Yields the rows of the track in order of time, each with its epoch.
+    """
+    begun = next(mark.epoch for mark in passage.marks if mark.ends)
+    sound = {fix.vehicle for fix in heard[begun][1] if fix.position_m is not None}
+    names = [passage.follower.site.vehicles[who].id for who in np.flatnonzero(first.placed)]
+    if passage.follower.free_running or not passage.marks[0].ends or not sound.issuperset(names):
+        return
+    chain, rows, site = Chain(), [-1], passage.follower.site
+    belief = chain.knot(replace(first, about=None))
+    limit_s = first.time_s
+    for k in range(begun - 1, -1, -1):
+        epoch = heard[k][0]
+        if not len(epoch):
+            continue
+        time_s = min(passage.follower.time_of(epoch), limit_s)
+        if rate_hz is not None:
+            for stop in range(int(np.ceil(limit_s * rate_hz)) - 1, int(np.ceil(time_s * rate_hz)) - 1, -1):
+                belief = chain.knot(predict(belief, stop / rate_hz, passage.follower.motion))
+                rows.append(k)
+        belief = predict(belief, time_s, passage.follower.motion)
+        links = link(site, epoch.emitter, epoch.receiver)
+        asked = passage.follower.trusted(epoch)
+        belief, _, _ = update(belief, asked, links, np.isfinite(epoch.range_m))
+        own = [SIZE * who + i for who in np.flatnonzero(first.placed) for i in (0, 1)]
+        if belief.covariance[own, own].max() > BACK_SD_M**2:
+            break
+        belief = chain.knot(belief)
+        rows.append(-1 if rate_hz is not None else k)
+        limit_s = time_s
+    for k, smoothed in zip(reversed(rows), chain.back(), strict=True):
+        if k >= 0:
+            yield k, smoothed
 
 
 def estimates(belief: Belief, follower: Follower) -> list[Estimate]:
@@ -199,22 +313,22 @@ def estimates(belief: Belief, follower: Follower) -> list[Estimate]:
     return [estimate(belief, follower.site, int(who), "smoothed") for who in np.flatnonzero(belief.placed)]
 
 
-def guided(passage: Passage) -> Guide:
-    """Return what the next pass may know of a pass: its smoothed track."""
+def guided(passage: Passage, before: tuple[Opening, ...] = ()) -> Guide:
+    """Return what the next pass may know of a pass: its smoothed track, with the headings that it had opened before."""
     belief = passage.follower.belief
     inputs, count = belief.inputs, passage.epochs
     n = SIZE * len(belief.placed) + (inputs.size if inputs is not None else 0) + 2
     row = np.full((0 if inputs is None else len(inputs.time_s), n), np.nan)
     now, sd = np.full((count, n), np.nan), np.full((count, n), np.nan)
-    since: dict[int, tuple[float, float]] = {}  # of headings, going back: the first time known, and how it was then
-    openings: list[Opening] = []
-    known, times_s = np.zeros(0, bool), np.full(count, np.nan)
+    times_s = np.full(count, np.nan)
     for mark, smoothed in passage.back():
         state = np.where(smoothed.free, smoothed.mean, np.nan)
         if mark.ends:
             now[mark.epoch], times_s[mark.epoch] = state, smoothed.time_s
             sd[mark.epoch] = np.sqrt(np.maximum(smoothed.covariance.diagonal(), 1e-30))
         row[list(mark.rows)] = state
+    openings = [replace(old, yaw_rad=float(now[old.epoch, SIZE * old.vehicle + YAW])) for old in before]
+    openings = [opening for opening in openings if np.isfinite(opening.yaw_rad)]
     if inputs is not None:
         for who in np.flatnonzero(inputs.wheel_slot >= 0).tolist():
             openings += _backwards(inputs, who, times_s, row, now)
