@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 from test_track_statistics import CASES, MOTION, OUTSIDE, STATES, Case, draw_clock, draw_truth, epoch_at
 
-from locate.made_epochs import HALL, SPEED, Drive, make_epoch, make_site
+from locate.made_epochs import HALL, Drive, make_epoch, make_site
 from sonofix.locate.fix import fix
 from sonofix.records import Estimate, Floats, Table
 from sonofix.track import wheels
@@ -75,7 +75,7 @@ def errors_of(got: Estimate, pose: Floats) -> Floats:
 
 
 def test_a_start_without_heading_is_linearised_until_its_errors_are_honest() -> None:
-    site, runs, found = make_site(HALL, level_m=1.1), 40, []
+    site, runs, found = make_site(HALL, level_m=1.1), 25, []
     for seed in range(runs):
         rng = np.random.default_rng([23, seed])
         table, times, poses = odometry_drive(rng, 12.0)
@@ -85,8 +85,7 @@ def test_a_start_without_heading_is_linearised_until_its_errors_are_honest() -> 
         track = smooth(lambda inputs=inputs: Follower(site, inputs=inputs), [(e, (fix(e, site, "v"),)) for e in epochs])
         found.append([errors_of(got, poses[5 * k]) for k, (got,) in enumerate(track, start=1)])
     nees = np.array(found)
-    print(nees.mean(axis=0))
+
     for column, degrees in ((0, 2), (1, 1)):
         high = chi2.ppf(1 - OUTSIDE, degrees * runs) / runs
         assert nees[:, :, column].mean(axis=0).max() < high
-    assert epochs[0].sound_speed_mps == SPEED

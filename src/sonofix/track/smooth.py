@@ -7,7 +7,7 @@ Newton's method for the most likely track (Bell 1994, "The iterated Kalman smoot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,6 +93,7 @@ class Passage:
         self.epochs = 0
         self.used: list[NDArray[np.bool_]] = []
         self.events: list[tuple[Event, ...]] = []
+        self.trusted: list[RangeEpoch] = []
         self._rate_hz = rate_hz
         self._guide = guide
         self._relinearise = relinearise
@@ -109,6 +110,7 @@ class Passage:
         if self._guide is not None:
             about = Nominal(self._guide.row, self._guide.now[self.epochs])
             follower.belief = replace(follower.belief, about=about)
+        self.trusted.append(follower.trusted(epoch))
         _, used, events = follower.step(epoch, fixes)
         self.used.append(used)
         self.events.append(events)
@@ -182,9 +184,16 @@ def smooth(
         Of source "smoothed", in order of time: what falls to each epoch.
     """
     passage = settle(begin, heard, rate_hz, passes, on_epoch)
+    return track(passage, heard, passage.back(), rate_hz)
+
+
+def track(
+    passage: Passage, heard: Sequence[Heard], smoothed: Iterable[tuple[Mark, Belief]], rate_hz: float | None
+) -> list[tuple[Estimate, ...]]:
+    """Return what falls to each epoch of a passage whose knots were smoothed, last first."""
     out: list[list[Estimate]] = [[] for _ in heard]
     first: Belief | None = None
-    for mark, belief in passage.back():
+    for mark, belief in smoothed:
         first = belief
         if mark.told:
             out[mark.epoch][:0] = estimates(belief, passage.follower)
@@ -200,11 +209,15 @@ def settle(
     rate_hz: float | None,
     passes: int,
     on_epoch: Callable[[], None],
+    rows: bool = False,
 ) -> Passage:
-    """Pass through a recording, as `smooth` says, until the track stays where it is; return the last pass."""
+    """Pass through a recording, as `smooth` says, until the track stays where it is; return the last pass.
+
+    ``rows``: it shall have knots before rows of the inputs in any case.
+    """
     guide: Guide | None = None
     for left in reversed(range(passes)):
-        passage = Passage(begin(), rate_hz, guide, left > 0)
+        passage = Passage(begin(), rate_hz, guide, rows or left > 0)
         for one in heard:
             passage.take(one)
             on_epoch()
