@@ -38,6 +38,9 @@ REOPENED_MPS = 1.0
 
 ITERATIONS = 30
 
+MISSING = "a factor graph needs gtsam: pip install 'sonofix[graph]', or smooth without one"
+"""What is said where gtsam is not installed."""
+
 
 def smooth(
     begin: Callable[[], Follower],
@@ -55,8 +58,10 @@ def smooth(
     ValueError
         If bursts come from a clock of their own (each epoch has another offset).
     """
-    import gtsam
-
+    try:
+        import gtsam
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(MISSING, name=error.name) from error
     if begin().free_running:
         raise ValueError("a graph needs a clock that goes on from epoch to epoch; use --smooth without --graph here")
     passage = settle(begin, heard, rate_hz, passes, on_epoch, rows=True)
