@@ -12,7 +12,10 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.test_run import OUTPUTS, ranged, rows_of
+from sonofix import flow
+from sonofix.cli.console import Stopped
 from sonofix.cli.main import app
+from sonofix.cli.run import run_folder
 
 runner = CliRunner()
 
@@ -87,6 +90,23 @@ def test_without_gtsam_the_extra_is_named_before_anything_is_run(tmp_path, monke
     assert said.exit_code == 2
     assert "sonofix[graph]" in said.stderr
     assert not (folder / "out").exists()
+
+
+def test_ctrl_c_lets_what_waits_for_its_lag_leave(tmp_path, monkeypatch):
+    folder, flow_run = ranged(tmp_path / "rec", 60), flow.run
+
+    def stopping(*given):
+        for k, step in enumerate(flow_run(*given)):
+            if k == 25:
+                raise KeyboardInterrupt
+            yield step
+
+    monkeypatch.setattr(flow, "run", stopping)
+    with pytest.raises(Stopped, match="holds the first 25 epochs"):
+        run_folder(folder, folder / "out", plot=False, rate_hz=None, lag_s=1000.0)
+    rows = rows_of(folder / "out" / "track.csv")
+    assert len(rows) == 25
+    assert {row["source"] for row in rows} == {"smoothed"}
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from locate.made_epochs import HALL, make_site
+from sonofix.geometry import POSE
 from sonofix.records import Floats
 from sonofix.track.anchor import correct
 from sonofix.track.belief import Belief, Motion, blank, predict, reopen, start_at
@@ -16,7 +17,7 @@ from sonofix.track.chain import Chain, copied, parted, tie
 
 SITE = make_site(HALL, level_m=1.1)
 MOTION = Motion(acceleration_psd=0.3)
-OWN = [0, 1, 4, 5]
+OWN = [POSE.index(name) for name in ("x", "y", "vx", "vy")]
 """Where x, y and their velocities stand."""
 
 NOISE_M = 0.1
@@ -84,7 +85,7 @@ def test_a_chain_is_the_least_squares_solution_of_all_at_once(rng: np.random.Gen
         own = slice(4 * k, 4 * k + 4)
         np.testing.assert_allclose(one.covariance[np.ix_(OWN, OWN)], covariance[own, own], rtol=0, atol=1e-9)
         assert one.time_s == times[k]
-        assert len(one.mean) == 10
+        assert len(one.mean) == len(POSE) + 2
 
 
 def test_a_copy_changes_nothing_of_what_is_believed(rng: np.random.Generator) -> None:
@@ -136,7 +137,8 @@ def test_what_is_placed_anew_is_not_tied_to_before() -> None:
             belief = measured(belief, np.array([1.0, 2.0]))
         else:  # as `place` does
             mean, covariance = belief.mean.copy(), belief.covariance.copy()
-            covariance[:8, :] = covariance[:, :8] = 0.0
+            own = slice(0, len(POSE))
+            covariance[own, :] = covariance[:, own] = 0.0
             mean[:2] = 9.0
             covariance[OWN, OWN] = 0.01
             belief = replace(belief, mean=mean, covariance=covariance)

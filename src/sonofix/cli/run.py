@@ -102,11 +102,14 @@ def run_folder(
     try:
         with progress_bar() as bar:
             watched, on_step = _watched(recording, bar)
-            found = flow.run(watched, rate_hz)
+            stopped: list[bool] = []
+            found = _heeded(flow.run(watched, rate_hz), None if lag_s is None else stopped)
             if lag_s is not None:
                 found = flow.smoothed(recording, found, rate_hz, lag_s)
             keep = steps.append if whole else sample.add
             files.write_run(out, _seen(found, tally.add, keep, on_step), recording.site)
+            if stopped:
+                raise KeyboardInterrupt
             if whole and steps:
                 on_epoch = _smoothing(bar, len(steps))
                 steps = list(flow.smoothed(recording, steps, rate_hz, graph=graph, on_epoch=on_epoch))
@@ -160,7 +163,18 @@ def _seen(steps: Iterator[Step], *watchers: Callable[[Step], None]) -> Iterator[
         yield step
         for watcher in watchers:
             watcher(step)
-        stop_if_asked()
+
+
+def _heeded(steps: Iterator[Step], stopped: list[bool] | None) -> Iterator[Step]:
+    """Pass steps on until Ctrl-C, which goes on as it came; or into a list where steps that wait are to leave first."""
+    try:
+        for step in steps:
+            yield step
+            stop_if_asked()
+    except KeyboardInterrupt:
+        if stopped is None:
+            raise
+        stopped.append(True)
 
 
 class _Sample:

@@ -73,6 +73,8 @@ class Belief:
         What the vehicles' own sensors tell, past and to come; only what is past enters.
     about : Nominal or None
         Where measurements are linearised; None: at ``mean``.
+
+    While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
 
     time_s: float
@@ -90,7 +92,8 @@ class Belief:
     def near(self, nominal: Floats, mean: Floats) -> Floats:
         """Return where to linearise: a `Nominal` state, its turns counted as ``mean`` counts them, else ``mean``."""
         nominal = nominal.copy()
-        for vehicle, at in enumerate(range(3, SIZE * len(self.placed), SIZE)):
+        for vehicle in range(len(self.placed)):
+            at = SIZE * vehicle + POSE.index("yaw")
             off = (mean[at] - nominal[at]) / (2 * np.pi)
             if abs(off) > 0.5:  # never where it is not known
                 nominal[at] += 2 * np.pi * round(off)

@@ -170,7 +170,7 @@ class Problem:
         step, noise = _transition(self._passage, before.belief, node.belief.time_s)
         names = [vehicle.id for vehicle in self._passage.follower.site.vehicles]
         anew = ~before.belief.placed & node.belief.placed
-        for event in self._passage.events[node.mark.epoch] if node.mark.ends else ():
+        for event in node.mark.entered.events if node.mark.entered is not None else ():
             if event.event not in ("slip", "reset"):
                 continue
             who = names.index(event.vehicle)
@@ -206,12 +206,12 @@ class Problem:
     def _hear(self, k: int, anew: NDArray[np.bool_]) -> None:
         """Let the ranges of a node's epoch enter that entered the filter; those that placed a vehicle had their say."""
         node = self.nodes[k]
-        if not node.mark.ends:
+        if node.mark.entered is None:
             return
-        epoch = self._passage.trusted[node.mark.epoch]
+        epoch = node.mark.entered.ranges
         links = link(self._passage.follower.site, epoch.emitter, epoch.receiver)
         placing = np.append(anew, False)
-        used = self._passage.used[node.mark.epoch] & ~placing[links.emitter_vehicle] & ~placing[links.receiver_vehicle]
+        used = node.mark.entered.used & ~placing[links.emitter_vehicle] & ~placing[links.receiver_vehicle]
         rows = np.flatnonzero(used)
         if not len(rows):
             return

@@ -41,13 +41,31 @@ ANY_HEADING_RAD = float(np.pi / np.sqrt(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Entered:
+    """What an epoch did to the filter: its ranges as they were trusted, which of them entered, and its events."""
+
+    ranges: RangeEpoch
+    used: NDArray[np.bool_]
+    events: tuple[Event, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Mark:
-    """What a knot is for: the epoch it belongs to, the rows of the inputs it stands just before, a row of the track."""
+    """What a knot is for.
+
+    ``epoch`` is the number of that it belongs to, ``rows`` those of the inputs that it stands just before; ``told``: it
+    is a row of the track; ``entered``: it is its epoch's end.
+    """
 
     epoch: int
     rows: tuple[int, ...] = ()
     told: bool = False
-    ends: bool = False
+    entered: Entered | None = None
+
+    @property
+    def ends(self) -> bool:
+        """Whether it is the end of its epoch."""
+        return self.entered is not None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,9 +109,6 @@ class Passage:
         self.chain = Chain()
         self.marks: list[Mark] = []
         self.epochs = 0
-        self.used: list[NDArray[np.bool_]] = []
-        self.events: list[tuple[Event, ...]] = []
-        self.trusted: list[RangeEpoch] = []
         self._rate_hz = rate_hz
         self._guide = guide
         self._relinearise = relinearise
@@ -110,15 +125,13 @@ class Passage:
         if self._guide is not None:
             about = Nominal(self._guide.row, self._guide.now[self.epochs])
             follower.belief = replace(follower.belief, about=about)
-        self.trusted.append(follower.trusted(epoch))
+        trusted = follower.trusted(epoch)
         _, used, events = follower.step(epoch, fixes)
-        self.used.append(used)
-        self.events.append(events)
         for opening in self._guide.openings if self._guide is not None else ():
             if opening.epoch == self.epochs:
                 follower.belief = _opened(follower.belief, opening)
         if follower.belief.placed.any():
-            self._knot(Mark(self.epochs, told=self._rate_hz is None, ends=True))
+            self._knot(Mark(self.epochs, told=self._rate_hz is None, entered=Entered(trusted, used, events)))
             if self._rate_hz is not None and self._written is None:
                 self._written = int(np.ceil(follower.belief.time_s * self._rate_hz))
         self.epochs += 1
