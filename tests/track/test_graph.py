@@ -13,7 +13,8 @@ from sonofix.records import Estimate
 from sonofix.track import graph
 from sonofix.track.follow import Follower
 from sonofix.track.inputs import gather
-from sonofix.track.smooth import Heard, smooth
+from sonofix.track.passage import Heard
+from sonofix.track.smooth import smooth
 from track.made_walks import SITE as HALLWAY
 from track.made_walks import Walk, epoch_of, steps_of
 from track.test_follow_team import robots_epoch, two_robots

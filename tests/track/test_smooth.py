@@ -11,12 +11,15 @@ import pytest
 from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of
 from sonofix.files import read_recording, read_truth
 from sonofix.flow import run, smoothed
+from sonofix.geometry import POSE
 from sonofix.locate.fix import fix
 from sonofix.records import Estimate, Floats, RangeEpoch, Step, Table, Truth
 from sonofix.site import Site
+from sonofix.track.belief import predict
 from sonofix.track.follow import Follower
 from sonofix.track.inputs import gather
-from sonofix.track.smooth import FixedLag, Heard, smooth
+from sonofix.track.passage import Heard
+from sonofix.track.smooth import FixedLag, smooth
 from track.made_walks import SITE as HALLWAY
 from track.made_walks import Walk, epoch_of, steps_of
 from track.test_follow_team import robots_epoch, two_robots
@@ -253,3 +256,35 @@ def test_a_real_drive_smoothed(data: Path) -> None:
 
     assert rms(after) < 0.040
     assert rms(after) < 0.7 * rms(steps)
+
+
+def test_where_to_linearise_counts_turns_as_the_track_does() -> None:
+    site = make_site(HALL, level_m=1.1)
+    times = np.arange(0.0, 2.0, 0.1)
+    belief = Follower(site, inputs=gather(site, {"odometry": odometry(np.column_stack([times, times, times]))})).belief
+    yaw, anchor = POSE.index("yaw"), len(POSE) + 2
+    mean, nominal = belief.mean.copy(), np.full(len(belief.mean), np.nan)
+    mean[yaw], mean[anchor] = 7.0, 6.9
+    nominal[yaw], nominal[anchor] = 0.5, 0.4
+    got = belief.near(nominal, mean)
+    assert got[yaw] == pytest.approx(0.5 + 2 * np.pi)
+    assert got[anchor] == pytest.approx(0.4 + 2 * np.pi)
+    got[[yaw, anchor]] = mean[[yaw, anchor]]
+    np.testing.assert_array_equal(got, mean)  # what is not known stays
+
+
+def test_a_row_told_at_the_instant_of_a_knot_is_not_lost() -> None:
+    site = make_site(HALL, level_m=1.1)
+    times = np.arange(0.0, 1.05, 0.1)
+    follower = Follower(
+        site, inputs=gather(site, {"odometry": odometry(np.column_stack([times, 0.5 + 0 * times, 0 * times]))})
+    )
+    follower.start("v", 0.05, np.array([2.0, 2.0, 1.1]), 0.0)
+    whole = halted = follower.belief
+    whole = predict(whole, 0.95, follower.motion)
+    for time_s in times[1:-1]:
+        for stop_s in (np.nextafter(time_s, -np.inf), time_s):
+            halted = predict(halted, float(stop_s), follower.motion)
+    halted = predict(halted, 0.95, follower.motion)
+    np.testing.assert_allclose(halted.mean, whole.mean, atol=1e-12)
+    np.testing.assert_allclose(halted.covariance, whole.covariance, atol=1e-12)

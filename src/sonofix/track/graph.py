@@ -21,7 +21,8 @@ from sonofix.track import steps, wheels
 from sonofix.track.belief import SIZE, Belief, predict
 from sonofix.track.follow import SLIPPED_M, Follower
 from sonofix.track.inputs import COMPASS, STEP
-from sonofix.track.smooth import PASSES, YAW, Heard, Mark, Passage, settle, track
+from sonofix.track.passage import YAW, Heard, Mark, Passage
+from sonofix.track.smooth import PASSES, settle, track
 from sonofix.track.update import _expected
 
 FLOOR = 1e-3
