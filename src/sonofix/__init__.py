@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sonofix.channel import simulate
     from sonofix.draw.track import draw_track
     from sonofix.files import RecordingError, read_recording, read_site, read_truth, write_recording, write_run
-    from sonofix.flow import Receiver, run
+    from sonofix.flow import Receiver, run, smoothed
     from sonofix.score import score_ranges, score_track
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "score_ranges",
     "score_track",
     "simulate",
+    "smoothed",
     "write_recording",
     "write_run",
 ]
@@ -48,6 +49,7 @@ _HOMES = {
     "score_ranges": "sonofix.score",
     "score_track": "sonofix.score",
     "simulate": "sonofix.channel",
+    "smoothed": "sonofix.flow",
     "write_recording": "sonofix.files",
     "write_run": "sonofix.files",
 }

@@ -5,7 +5,8 @@ File, live and simulation run this.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 
@@ -39,6 +40,7 @@ from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, estimate, predict
 from sonofix.track.follow import Follower, expectations
 from sonofix.track.inputs import gather
+from sonofix.track.smooth import FixedLag, smooth
 
 DEFAULT_MAX_SPEED_MPS = 3.0
 """Of a vehicle whose site file states none."""
@@ -71,6 +73,86 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
             yield street.walk(epoch)
     else:
         raise ValueError("the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv")
+
+
+def smoothed(
+    recording: Recording,
+    steps: Iterable[Step],
+    rate_hz: float | None = None,
+    lag_s: float | None = None,
+    graph: bool = False,
+    on_epoch: Callable[[], None] = lambda: None,
+) -> Iterator[Step]:
+    """Smooth the track of a recording that was run: each instant with what was heard before it and after.
+
+    Parameters
+    ----------
+    recording : Recording
+    steps : iterable of Step
+        As `run` yields them, all of them and in order.
+    rate_hz : float or None
+        Estimates at this rate; None: one an epoch.
+    lag_s : float or None
+        Look no further ahead: each step leaves once others so much later have come. None: between the recording's
+        ends, and linearised anew until the track stays where it is.
+    graph : bool
+        By a factor graph (gtsam).
+    on_epoch : callable
+        Is called for each epoch of each pass.
+
+    Yields
+    ------
+    Step, as they came, with estimates of source "smoothed"
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If ``graph`` is asked for and gtsam is not installed.
+    ValueError
+        If ``lag_s`` is below 0, or a lag is asked of a graph.
+    """
+    if lag_s is not None:
+        if lag_s < 0:
+            raise ValueError(f"lag: {lag_s:g} s; a smoother looks ahead by 0 s or more")
+        if graph:
+            raise ValueError("a graph smooths between a recording's ends; leave out either the graph or the lag")
+        yield from _lagging(recording, steps, rate_hz, lag_s)
+        return
+    kept = list(steps)
+    if not kept:
+        return
+    how = smooth
+    if graph:
+        from sonofix.track.graph import smooth as how
+    tracks = how(
+        lambda: _beginning(recording, kept[0].ranges.sync_s),
+        [(step.ranges, step.fixes) for step in kept],
+        rate_hz,
+        on_epoch=on_epoch,
+    )
+    for step, estimates in zip(kept, tracks, strict=True):
+        yield replace(step, estimates=estimates)
+
+
+def _lagging(recording: Recording, steps: Iterable[Step], rate_hz: float | None, lag_s: float) -> Iterator[Step]:
+    """Smooth steps while they come."""
+    waiting: deque[Step] = deque()
+    lag: FixedLag | None = None
+    for step in steps:
+        lag = lag or FixedLag(_beginning(recording, step.ranges.sync_s), lag_s, rate_hz)
+        waiting.append(step)
+        for estimates in lag.take((step.ranges, step.fixes)):
+            yield replace(waiting.popleft(), estimates=estimates)
+    for estimates in lag.finish() if lag is not None else ():
+        yield replace(waiting.popleft(), estimates=estimates)
+
+
+def _beginning(recording: Recording, time_s: float) -> Follower:
+    """Return a follower of a recording as `run` begins with one at the first epoch."""
+    street = Street(recording.site, recording.tables.get("start"))
+    street.sense(recording.tables, stated=recording.blocks is None or recording.rate_hz is None)
+    street.begin(time_s)
+    return street.follower
 
 
 def _run_samples(
@@ -180,8 +262,7 @@ class Street:
 
     def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
         """Take in the ranges of one epoch."""
-        if self._start is not None:
-            self._place(self._start, epoch.sync_s)
+        self.begin(epoch.sync_s)
         epoch, fixes, told = self.air.take(epoch, lambda e: tuple(fix(e, self.site, v.id) for v in self.site.vehicles))
         before = self.follower.belief
         estimates, used, events = self.follower.step(epoch, fixes)
@@ -199,9 +280,11 @@ class Street:
             estimates = self._between(before, estimates)
         return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
 
-    def _place(self, start: Table, time_s: float) -> None:
+    def begin(self, time_s: float) -> None:
         """Put vehicles where start.csv says, once."""
-        self._start = None
+        if self._start is None:
+            return
+        start, self._start = self._start, None
         if not self.site.vehicles:
             raise ValueError("start.csv places a vehicle, but the site has none: add a [[vehicle]]")
         vehicles = start.names.get("vehicle") or (self.site.vehicles[0].id,) * len(start.columns["x_m"])

@@ -300,7 +300,8 @@ class Estimate:
     """The track of one vehicle at one instant: what its filter believes.
 
     ``states`` names the rows of ``covariance`` (x, y, z, yaw, clock, vx, vy, vz as estimated); the pose is that of the
-    vehicle's origin. ``source``: "fix" or "fused" where a measurement entered, "predicted" where none did.
+    vehicle's origin. ``source``: "fix" or "fused" where a measurement entered, "predicted" where none did,
+    "smoothed" where what came later did too.
     """
 
     time_s: float

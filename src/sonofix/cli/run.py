@@ -29,13 +29,58 @@ def run(
     rate: Annotated[
         float | None, typer.Option(help="Rows of track.csv a second (Hz). [default: one an epoch]", min=1e-3, max=1e4)
     ] = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Smooth the track, once all is read: each row knows what came after it.")
+    ] = False,
+    lag: Annotated[
+        float | None,
+        typer.Option(help="Smooth on the way, looking this far ahead (s); rows leave so much later.", min=0.0),
+    ] = None,
+    graph: Annotated[
+        bool, typer.Option("--graph", help="Smooth by a factor graph (needs gtsam: the extra graph).")
+    ] = False,
 ) -> None:
-    """Turn a recording into ranges, fixes, a track and a picture."""
-    run_folder(recording, out or recording / "out", plot, rate)
+    """Turn a recording into ranges, fixes, a track and a picture.
+
+    \b
+    sonofix run FOLDER                  the track as it was known at each moment
+    sonofix run FOLDER --smooth         the best track afterwards, by all of the recording
+    sonofix run FOLDER --lag 5          the same on the way, five seconds late
+    sonofix run FOLDER --smooth --rate 20
+    """
+    if graph:
+        require_gtsam()
+        if lag is not None:
+            raise ValueError("--graph smooths a whole recording, --lag looks ahead by some seconds: leave out either")
+    run_folder(recording, out or recording / "out", plot, rate, smooth or graph, lag, graph)
 
 
-def run_folder(folder: Path, out: Path, plot: bool, rate_hz: float | None) -> None:
+def require_gtsam() -> None:
+    """Raise where gtsam is not installed, before anything is run.
+
+    Raises
+    ------
+    ValueError
+        That names the extra.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("gtsam") is None:
+        raise ValueError("--graph needs gtsam: pip install 'sonofix[graph]', or smooth with --smooth alone")
+
+
+def run_folder(
+    folder: Path,
+    out: Path,
+    plot: bool,
+    rate_hz: float | None,
+    smooth: bool = False,
+    lag_s: float | None = None,
+    graph: bool = False,
+) -> None:
     """Run a recording folder, write everything to `out`, and print the summary.
+
+    The causal track is written on the way, and replaced at the end where it is to be smoothed as a whole.
 
     Raises
     ------
@@ -52,14 +97,32 @@ def run_folder(folder: Path, out: Path, plot: bool, rate_hz: float | None) -> No
     recording = files.read_recording(folder, to_run=True)
     truths = files.read_truth(folder)
     tally, sample = Tally(recording.site), _Sample(_MOST_DRAWN)
+    whole = smooth and lag_s is None
+    steps: list[Step] = []
     try:
         with progress_bar() as bar:
             watched, on_step = _watched(recording, bar)
-            steps = flow.run(watched, rate_hz)
-            files.write_run(out, _seen(steps, tally.add, sample.add, on_step), recording.site)
+            stopped: list[bool] = []
+            found = _heeded(flow.run(watched, rate_hz), None if lag_s is None else stopped)
+            if lag_s is not None:
+                found = flow.smoothed(recording, found, rate_hz, lag_s)
+            keep = steps.append if whole else sample.add
+            files.write_run(out, _seen(found, tally.add, keep, on_step), recording.site)
+            if stopped:
+                raise KeyboardInterrupt
+            if whole and steps:
+                on_epoch = _smoothing(bar, len(steps))
+                steps = list(flow.smoothed(recording, steps, rate_hz, graph=graph, on_epoch=on_epoch))
+                files.write_track(out, steps, recording.site)
     except KeyboardInterrupt:
         kept = f"{out} holds the first {counted(tally.epochs, 'epoch')}" if tally.epochs else "nothing was kept"
+        kept += ", not smoothed" if whole and tally.epochs else ""
         raise Stopped(f"stopped; {kept}") from None
+    if whole:
+        tally = Tally(recording.site)
+        for step in steps:
+            tally.add(step)
+            sample.add(step)
     picture = out / "track.png"
     picture.unlink(missing_ok=True)
     if not tally.epochs:
@@ -81,13 +144,37 @@ def _watched(recording: Recording, bar: Progress) -> tuple[Recording, Callable[[
     return watched(recording, lambda count: bar.advance(task, count)), lambda step: None
 
 
+def _smoothing(bar: Progress, epochs: int) -> Callable[[], None]:
+    """Show a bar of its own for smoothing; return what counts an epoch of one of its passes."""
+    from sonofix.track.smooth import PASSES
+
+    task = bar.add_task("smoothing", total=PASSES * epochs)
+
+    def count() -> None:
+        bar.advance(task)
+        stop_if_asked()
+
+    return count
+
+
 def _seen(steps: Iterator[Step], *watchers: Callable[[Step], None]) -> Iterator[Step]:
     """Pass steps on; each watcher is shown a step once it has been written."""
     for step in steps:
         yield step
         for watcher in watchers:
             watcher(step)
-        stop_if_asked()
+
+
+def _heeded(steps: Iterator[Step], stopped: list[bool] | None) -> Iterator[Step]:
+    """Pass steps on until Ctrl-C, which goes on as it came; or into a list where steps that wait are to leave first."""
+    try:
+        for step in steps:
+            yield step
+            stop_if_asked()
+    except KeyboardInterrupt:
+        if stopped is None:
+            raise
+        stopped.append(True)
 
 
 class _Sample:

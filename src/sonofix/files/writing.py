@@ -41,6 +41,34 @@ def write_run(out: str | Path, steps: Iterable[Step], site: Site) -> None:
             writer.write(step)
 
 
+def write_track(out: str | Path, steps: Iterable[Step], site: Site) -> None:
+    """Write the track of a run anew, its other files left as they are; each file whole or not at all.
+
+    Raises
+    ------
+    RecordingError
+        Where it cannot be written.
+    """
+    found = sorted((estimate for step in steps for estimate in step.estimates), key=lambda estimate: estimate.time_s)
+
+    def write(name: str, header: list[str] | None, separator: str, rows: list[tuple[float, list[str]]]) -> None:
+        def make(path: Path) -> None:
+            file = _RowFile(path, header, separator)
+            try:
+                file.add(rows)
+                file.release(math.inf)
+                file.close()
+            finally:
+                file.abandon()
+
+        write_whole(Path(out) / name, make)
+
+    write("track.csv", COLUMNS["track.csv"].split(","), ",", [(e.time_s, _track_row(e)) for e in found])
+    for vehicle in site.vehicles:
+        rows = [(e.time_s, _tum_row(e)) for e in found if e.vehicle == vehicle.id]
+        write(_tum_name(site, vehicle.id), None, " ", rows)
+
+
 class RunWriter:
     """The files of one run, as a context manager; `write` takes the steps in their order.
 
@@ -83,7 +111,7 @@ class RunWriter:
             for name, header in COLUMNS.items():
                 self._files[name] = _RowFile(self.out / name, header.split(","), ",")
             for vehicle in self._site.vehicles:
-                self._files[f"tum {vehicle.id}"] = _RowFile(self.out / self._tum_name(vehicle.id), None, " ")
+                self._files[f"tum {vehicle.id}"] = _RowFile(self.out / _tum_name(self._site, vehicle.id), None, " ")
         except BaseException:
             self._abandon()
             raise
@@ -119,17 +147,13 @@ class RunWriter:
         for estimate in step.estimates:
             key = f"tum {estimate.vehicle}"
             if key not in self._files:
-                self._files[key] = _RowFile(self.out / self._tum_name(estimate.vehicle), None, " ")
+                self._files[key] = _RowFile(self.out / _tum_name(self._site, estimate.vehicle), None, " ")
             self._files[key].add([(estimate.time_s, _tum_row(estimate))])
         # Sound that is heard after the next epoch began may come after that epoch's first rows.
         final_s = -math.inf if self._last_sync_s is None else 2 * sync_s - self._last_sync_s
         self._last_sync_s = sync_s
         for file in self._files.values():
             file.release(final_s)
-
-    def _tum_name(self, vehicle: str) -> str:
-        safe = re.sub(r"[^\w.-]", "_", vehicle)
-        return "track.tum" if len(self._site.vehicles) < 2 else f"track-{safe}.tum"
 
     def _fix_row(self, fix: Fix, ranges: RangeEpoch) -> list[str]:
         heard = self._concerns(fix.vehicle, ranges)
@@ -305,6 +329,11 @@ def _covariance(fix: Fix, a: str, b: str) -> float | None:
     if fix.covariance is None or a not in fix.states or b not in fix.states:
         return None
     return float(fix.covariance[fix.states.index(a), fix.states.index(b)])
+
+
+def _tum_name(site: Site, vehicle: str) -> str:
+    safe = re.sub(r"[^\w.-]", "_", vehicle)
+    return "track.tum" if len(site.vehicles) < 2 else f"track-{safe}.tum"
 
 
 def _cell(value: float | None, form: str) -> str:

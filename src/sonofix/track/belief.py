@@ -43,6 +43,18 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Nominal:
+    """A track known beforehand, about which a smoother's later passes linearise.
+
+    ``row`` (k, m) is the state just before each row of the inputs, ``now`` (m,) that at the epoch's instant; NaN where
+    not known. The m components are those of a belief without copies.
+    """
+
+    row: Floats
+    now: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Belief:
     """Joint Gaussian over all vehicles and the recorder's clock.
 
@@ -59,6 +71,10 @@ class Belief:
         Vehicles that have a position yet.
     inputs : Inputs or None
         What the vehicles' own sensors tell, past and to come; only what is past enters.
+    about : Nominal or None
+        Where measurements are linearised; None: at ``mean``.
+
+    While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
 
     time_s: float
@@ -67,10 +83,26 @@ class Belief:
     free: NDArray[np.bool_]
     placed: NDArray[np.bool_]
     inputs: Inputs | None = None
+    about: Nominal | None = None
 
     def pose(self) -> Floats:
         """Poses (V, 8)."""
         return self.mean[: SIZE * len(self.placed)].reshape(-1, SIZE)
+
+    def near(self, nominal: Floats, mean: Floats) -> Floats:
+        """Return where to linearise: a `Nominal` state, its turns counted as ``mean`` counts them, else ``mean``."""
+        nominal = nominal.copy()
+        for vehicle in range(len(self.placed)):
+            at = SIZE * vehicle + POSE.index("yaw")
+            off = (mean[at] - nominal[at]) / (2 * np.pi)
+            if abs(off) > 0.5:  # never where it is not known
+                nominal[at] += 2 * np.pi * round(off)
+                if self.inputs is not None and self.inputs.wheel_slot[vehicle] >= 0:
+                    nominal[self.inputs.wheel_slot[vehicle] + 2] += 2 * np.pi * round(off)
+        out, known = mean.copy(), np.isfinite(nominal)
+        out[:-2][: len(nominal) - 2][known[:-2]] = nominal[:-2][known[:-2]]
+        out[-2:][known[-2:]] = nominal[-2:][known[-2:]]
+        return out
 
 
 def blank(site: Site, inputs: Inputs | None = None) -> Belief:
@@ -126,7 +158,8 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     What sensors told of the motion on the way enters at its own time.
     """
     dt = time_s - belief.time_s
-    if abs(dt) < INSTANT_S or not belief.placed.any():
+    told = range(0) if belief.inputs is None else belief.inputs.within(belief.time_s, time_s)
+    if (abs(dt) < INSTANT_S and not told) or not belief.placed.any():
         return replace(belief, time_s=time_s)
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free
     densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd])
@@ -135,7 +168,7 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
         age(mean, covariance, free, belief.placed, densities, float(dt))
         return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
     free = free.copy()
-    for row in (*inputs.within(now_s, time_s), None):
+    for row in (*told, None):
         until_s = time_s if row is None else float(inputs.time_s[row])
         age(mean, covariance, free, belief.placed, densities, until_s - now_s)
         for vehicle, (step, wheel) in enumerate(
@@ -146,20 +179,23 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
             if wheel >= 0:
                 wheels.wander(covariance, free, vehicle, wheel, until_s - now_s)
         if row is not None and belief.placed[inputs.vehicle[row]]:
-            _sense(mean, covariance, free, inputs, row)
+            about = None if belief.about is None else belief.near(belief.about.row[row], mean)
+            _sense(mean, covariance, free, inputs, row, about)
         now_s = until_s
     return replace(belief, time_s=time_s, mean=mean, covariance=covariance, free=free)
 
 
-def _sense(mean: Floats, covariance: Floats, free: NDArray[np.bool_], inputs: Inputs, row: int) -> None:
-    """Let one row of a vehicle's sensors enter, in place, at its time."""
+def _sense(
+    mean: Floats, covariance: Floats, free: NDArray[np.bool_], inputs: Inputs, row: int, about: Floats | None
+) -> None:
+    """Let one row of a vehicle's sensors enter, in place, at its time, linearised at ``about`` or else at the mean."""
     vehicle = int(inputs.vehicle[row])
     first, second, third, fourth = inputs.value[row].tolist()
     if inputs.kind[row] == STEP:
-        steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second)
+        steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second, about)
     elif inputs.kind[row] == WHEELS:
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
-        wheels.take(mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm)
+        wheels.take(mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about)
     else:
         wheels.point(mean, covariance, free, vehicle, first)
 

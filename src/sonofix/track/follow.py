@@ -96,7 +96,7 @@ class Follower:
         self._gather(epoch)
         taken = self._place(links, fixes, events)
         stated = epoch.snr_db is None
-        asked = replace(epoch, covariance_m2=self._doubt * epoch.covariance_m2) if stated else epoch
+        asked = self.trusted(epoch)
         # ranges that placed a vehicle have had their say
         before = self.belief
         self.belief, used, surprise = update(before, asked, links, candidates & ~taken)
@@ -108,6 +108,10 @@ class Follower:
         self.belief = self._course.head(self.belief)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
+
+    def time_of(self, epoch: RangeEpoch) -> float:
+        """Return the instant an epoch's state will belong to."""
+        return self._time(epoch, link(self.site, epoch.emitter, epoch.receiver))
 
     def _time(self, epoch: RangeEpoch, links: Links) -> float:
         """Instant the epoch's state belongs to; an empty epoch takes the delay that others showed."""
@@ -171,6 +175,10 @@ class Follower:
         covariance[-1, -1] = (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
         free[-2:] = True
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
+
+    def trusted(self, epoch: RangeEpoch) -> RangeEpoch:
+        """Return an epoch with the variances that stated ranges have been found to have."""
+        return replace(epoch, covariance_m2=self._doubt * epoch.covariance_m2) if epoch.snr_db is None else epoch
 
     def _learn(self, surprise: Floats) -> None:
         """Scale the variance that stated ranges claim until their innovations agree with it.

@@ -65,13 +65,17 @@ def take(
     slot: int,
     length_m: float,
     heading_rad: float,
+    about: Floats | None = None,
 ) -> None:
     """Correct a belief at a step's end, in place, and put the anchor there: the next step begins.
 
-    A step without an anchor, or with an empty cell, tells only that.
+    A step without an anchor, or with an empty cell, tells only that. The step is linearised at ``about``, or else at
+    the mean.
     """
     if free[slot] and np.isfinite(length_m) and np.isfinite(heading_rad):
-        _correct(mean, covariance, vehicle, slot, length_m, heading_rad)
+        about = mean if about is None else about
+        miss, derivative, noise = measure(about, vehicle, slot, length_m, heading_rad)
+        correct(mean, covariance, miss - derivative @ (mean - about), derivative, noise, UNLIKELY)
     at = len(POSE) * vehicle
     mean[slot : slot + 2] = mean[at : at + 2]
     covariance[slot : slot + 2, :] = covariance[at : at + 2, :]
@@ -79,19 +83,21 @@ def take(
     free[slot : slot + 2] = True
 
 
-def _correct(mean: Floats, covariance: Floats, vehicle: int, slot: int, length_m: float, heading_rad: float) -> None:
-    """Correct a belief by one step, in place.
+def measure(
+    about: Floats, vehicle: int, slot: int, length_m: float, heading_rad: float
+) -> tuple[Floats, Floats, Floats]:
+    """Return by how much a step misses a state (2,), what it measures there, and its covariance.
 
     With a the anchor and k and ψ the errors of length and heading, p − a = (1 − k) L u(h − ψ).
     """
     at = len(POSE) * vehicle
-    length = length_m * (1.0 - mean[slot + 2])
-    cos, sin = np.cos(heading_rad - mean[slot + 3]), np.sin(heading_rad - mean[slot + 3])
+    length = length_m * (1.0 - about[slot + 2])
+    cos, sin = np.cos(heading_rad - about[slot + 3]), np.sin(heading_rad - about[slot + 3])
     along, across = np.array([cos, sin]), np.array([-sin, cos])
-    miss = length * along - (mean[at : at + 2] - mean[slot : slot + 2])
-    derivative = np.zeros((2, len(mean)))
+    miss = length * along - (about[at : at + 2] - about[slot : slot + 2])
+    derivative = np.zeros((2, len(about)))
     derivative[0, at] = derivative[1, at + 1] = 1.0
     derivative[0, slot] = derivative[1, slot + 1] = -1.0
     derivative[:, slot + 2] = length_m * along
     derivative[:, slot + 3] = length * across
-    correct(mean, covariance, miss, derivative, STEP_SD_M**2 * np.eye(2), UNLIKELY)
+    return miss, derivative, STEP_SD_M**2 * np.eye(2)

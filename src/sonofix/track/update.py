@@ -52,8 +52,9 @@ def update(
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
     links = links.rows(rows)
-    shown, derivative = _expected(links, belief, belief.mean, dt, epoch, stated)
-    miss = measured - shown
+    mean = belief.mean if belief.about is None else belief.near(belief.about.now, belief.mean)
+    shown, derivative = _expected(links, belief, mean, dt, epoch, stated)
+    miss = measured - shown - derivative @ (belief.mean - mean)
     crossed = derivative @ belief.covariance
     surprise = miss**2 / (np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal())
     # a row is believed where its range is, and its rate if it has one
@@ -69,13 +70,13 @@ def update(
         both = np.tile(near, 2) if with_rates else near
         links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
         miss, derivative, crossed = miss[both], derivative[both], crossed[both]
-    mean, gain = belief.mean, np.zeros((0, 0))
-    for k in range(iterations):
+    gain = np.zeros((0, 0))
+    for k in range(iterations if belief.about is None else 1):
         if k:
             shown, derivative = _expected(links, belief, mean, dt, epoch, stated)
-            miss, crossed = measured - shown, derivative @ belief.covariance
+            miss, crossed = measured - shown - derivative @ (belief.mean - mean), derivative @ belief.covariance
         gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
-        moved = belief.mean + gain @ (miss - derivative @ (belief.mean - mean))
+        moved = belief.mean + gain @ miss
         settled = float(np.abs(moved - mean).max()) < SETTLED
         mean = moved
         if settled:

@@ -88,16 +88,19 @@ def take(
     slot: int,
     arc: tuple[float, float, float, float],
     arm: Floats,
+    about: Floats | None = None,
 ) -> None:
     """Correct a belief at the end of an arc, in place, and put the anchor there.
 
     ``arc`` is way, turn, time, and what it may have turned unseen at their end; ``arm`` (2,) is where the motion is
-    followed, from the vehicle's origin.
+    followed, from the vehicle's origin. The arc is linearised at ``about``, or else at the mean.
     """
     at = len(POSE) * vehicle
     way, turn, dt, unseen = arc
     if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and dt <= LONGEST_S:
-        _correct(mean, covariance, vehicle, slot, (way, turn, dt), arm)
+        about = mean if about is None else about
+        miss, derivative, noise = measure(about, vehicle, slot, (way, turn, dt), arm)
+        correct(mean, covariance, miss - derivative @ (mean - about), derivative, noise, UNLIKELY)
     if free[at + 3]:
         covariance[at + 3, at + 3] += unseen**2
     for own, of in ((slice(slot, slot + 2), slice(at, at + 2)), (slot + 2, at + 3)):
@@ -108,20 +111,20 @@ def take(
     free[slot + 2] = free[at + 3]
 
 
-def _correct(
-    mean: Floats, covariance: Floats, vehicle: int, slot: int, arc: tuple[float, float, float], arm: Floats
-) -> None:
-    """Correct a belief by one arc, in place.
+def measure(
+    about: Floats, vehicle: int, slot: int, arc: tuple[float, float, float], arm: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return by how much an arc (way, turn, time) misses a state (3,), what it measures there, and its covariance.
 
     With a and α the anchor's place and heading, k and b the errors of way and yaw rate, and ω = turn − b dt: ψ = α + ω,
     p − a = (1 − k) way sinc(ω/2) u(α + ω/2) + (R(ψ) − R(α)) arm.
     """
     at = len(POSE) * vehicle
     way, turn, dt = arc
-    before, now = mean[slot + 2], mean[at + 3]
-    turned = turn - mean[slot + 4] * dt
+    before, now = about[slot + 2], about[at + 3]
+    turned = turn - about[slot + 4] * dt
     bent = float(np.sinc(turned / (2 * np.pi)))
-    chord = way * (1.0 - mean[slot + 3]) * bent
+    chord = way * (1.0 - about[slot + 3]) * bent
     middle = before + turned / 2
     along = np.array([np.cos(middle), np.sin(middle)])
     across = np.array([-along[1], along[0]])
@@ -132,8 +135,8 @@ def _correct(
 
     here, there = swung(now), swung(before)
     shift = chord * along + here - there
-    miss = np.append(shift - (mean[at : at + 2] - mean[slot : slot + 2]), before + turned - now)
-    derivative = np.zeros((3, len(mean)))
+    miss = np.append(shift - (about[at : at + 2] - about[slot : slot + 2]), before + turned - now)
+    derivative = np.zeros((3, len(about)))
     derivative[0, at] = derivative[1, at + 1] = derivative[2, at + 3] = 1.0
     derivative[0, slot] = derivative[1, slot + 1] = derivative[2, slot + 2] = -1.0
     derivative[:2, slot + 2] = -chord * across + np.array([-there[1], there[0]])
@@ -143,7 +146,7 @@ def _correct(
     derivative[2, slot + 4] = dt
     place = CREEP_PSD * dt + SLIP_M * abs(way)
     heading = TWIST_PSD * dt + TWIST_M * abs(way) + TWIST_RAD * abs(turn)
-    correct(mean, covariance, miss, derivative, np.diag([place, place, heading]), UNLIKELY)
+    return miss, derivative, np.diag([place, place, heading])
 
 
 def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, heading_rad: float) -> None:

@@ -1,0 +1,199 @@
+"""Smoothing a recording: each instant with all that was told before it and after.
+
+The epochs are followed once more, with a knot (`chain`) at each of them and wherever a row is wished for, and smoothed
+backwards. What is not linear is then linearised anew about the smoothed track, until that stays where it is: Gauss and
+Newton's method for the most likely track (Bell 1994, "The iterated Kalman smoother as a Gauss-Newton method").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sonofix.geometry import link
+from sonofix.records import Estimate
+from sonofix.track.belief import SIZE, Belief, estimate, predict
+from sonofix.track.chain import Chain
+from sonofix.track.follow import Follower
+from sonofix.track.passage import Guide, Heard, Mark, Passage, guided
+from sonofix.track.update import update
+
+PASSES = 3
+"""Most passes through a recording."""
+
+SETTLED = 0.1
+"""Passes end when no state of an epoch moves by more of its own deviation."""
+
+BACK_SD_M = 1.0
+"""A track is led back to before its vehicle's first fix while its place is known better than this."""
+
+
+def smooth(
+    begin: Callable[[], Follower],
+    heard: Sequence[Heard],
+    rate_hz: float | None = None,
+    passes: int = PASSES,
+    on_epoch: Callable[[], None] = lambda: None,
+) -> list[tuple[Estimate, ...]]:
+    """Smooth a recording between its ends (fixed interval).
+
+    Parameters
+    ----------
+    begin : callable
+        Gives a follower as it was before the first epoch.
+    heard : sequence of (RangeEpoch, tuple of Fix)
+    rate_hz : float or None
+        Rows of the track a second; None: one an epoch.
+    passes : int
+        At most; 1 linearises where the filter did.
+    on_epoch : callable
+        Is called once an epoch and pass.
+
+    Returns
+    -------
+    list of tuple of Estimate, as long as ``heard``
+        Of source "smoothed", in order of time: what falls to each epoch.
+    """
+    passage = settle(begin, heard, rate_hz, passes, on_epoch)
+    return track(passage, heard, passage.back(), rate_hz)
+
+
+def track(
+    passage: Passage, heard: Sequence[Heard], smoothed: Iterable[tuple[Mark, Belief]], rate_hz: float | None
+) -> list[tuple[Estimate, ...]]:
+    """Return what falls to each epoch of a passage whose knots were smoothed, last first."""
+    out: list[list[Estimate]] = [[] for _ in heard]
+    first: Belief | None = None
+    for mark, belief in smoothed:
+        first = belief
+        if mark.told:
+            out[mark.epoch][:0] = estimates(belief, passage.follower)
+    if first is not None:
+        for epoch, belief in earlier(passage, heard, first, rate_hz):
+            out[epoch] += estimates(belief, passage.follower)
+    return [tuple(some) for some in out]
+
+
+def settle(
+    begin: Callable[[], Follower],
+    heard: Sequence[Heard],
+    rate_hz: float | None,
+    passes: int,
+    on_epoch: Callable[[], None],
+    rows: bool = False,
+) -> Passage:
+    """Pass through a recording, as `smooth` says, until the track stays where it is; return the last pass.
+
+    ``rows``: it shall have knots before rows of the inputs in any case.
+    """
+    guide: Guide | None = None
+    for left in reversed(range(passes)):
+        passage = Passage(begin(), rate_hz, guide, rows or left > 0)
+        for one in heard:
+            passage.take(one)
+            on_epoch()
+        if not left or not passage.marks:
+            return passage
+        following = guided(passage, () if guide is None else guide.openings)
+        if guide is not None:
+            with np.errstate(invalid="ignore"):
+                moved = np.abs(following.now - guide.now) / guide.sd
+            if not np.any(moved > SETTLED):
+                return passage
+        guide = following
+    raise ValueError(f"passes: {passes}; at least 1 is needed")
+
+
+class FixedLag:
+    """Smooths while epochs come: each leaves once others up to ``lag_s`` later are known. One pass, bounded memory.
+
+    Parameters
+    ----------
+    follower : Follower
+        As it was before the first epoch.
+    lag_s : float
+        Infinite: all leave at the end.
+    rate_hz : float or None
+        Rows of the track a second; None: one an epoch.
+    """
+
+    def __init__(self, follower: Follower, lag_s: float, rate_hz: float | None = None) -> None:
+        self._passage = Passage(follower, rate_hz, relinearise=False)
+        self._lag_s = lag_s
+        self._left = 0
+
+    def take(self, heard: Heard) -> list[tuple[Estimate, ...]]:
+        """Follow one epoch; return what falls to each epoch that leaves now, in order."""
+        self._passage.take(heard)
+        knots = self._passage.chain.knots
+        if not knots:
+            return self._leave(self._passage.epochs, 0)
+        due_s = knots[-1].belief.time_s - self._lag_s
+        count = sum(knot.belief.time_s <= due_s for knot in knots)
+        ended = [i for i, mark in enumerate(self._passage.marks[:count]) if mark.ends]
+        if not ended:
+            return []
+        return self._leave(self._passage.marks[ended[-1]].epoch + 1, ended[-1] + 1)
+
+    def finish(self) -> list[tuple[Estimate, ...]]:
+        """Return what falls to the epochs that have not left."""
+        return self._leave(self._passage.epochs, 0)
+
+    def _leave(self, epochs: int, knots: int) -> list[tuple[Estimate, ...]]:
+        """Let epochs go, as far as those before number ``epochs``, and what lies before knot ``knots``."""
+        out: list[list[Estimate]] = [[] for _ in range(epochs - self._left)]
+        if out:
+            for mark, belief in self._passage.back():
+                if mark.told and self._left <= mark.epoch < epochs:
+                    out[mark.epoch - self._left][:0] = estimates(belief, self._passage.follower)
+        self._left = max(epochs, self._left)
+        # the last knot's copy travels on
+        self._passage.forget(min(knots, len(self._passage.marks) - 1))
+        return [tuple(some) for some in out]
+
+
+def earlier(
+    passage: Passage, heard: Sequence[Heard], first: Belief, rate_hz: float | None
+) -> Iterator[tuple[int, Belief]]:
+    """Lead a smoothed track back to epochs before its first, by ranges too few for a fix and the motion alone.
+
+    ``first`` is the smoothed belief there. What began with ranges gathered from those epochs is not led back, nor what
+    has another clock in each. Yields the rows of the track in order of time, each with its epoch.
+    """
+    begun = next(mark.epoch for mark in passage.marks if mark.ends)
+    sound = {fix.vehicle for fix in heard[begun][1] if fix.position_m is not None}
+    names = [passage.follower.site.vehicles[who].id for who in np.flatnonzero(first.placed)]
+    if passage.follower.free_running or not passage.marks[0].ends or not sound.issuperset(names):
+        return
+    chain, rows, site = Chain(), [-1], passage.follower.site
+    belief = chain.knot(replace(first, about=None))
+    limit_s = first.time_s
+    for k in range(begun - 1, -1, -1):
+        epoch = heard[k][0]
+        if not len(epoch):
+            continue
+        time_s = min(passage.follower.time_of(epoch), limit_s)
+        if rate_hz is not None:
+            for stop in range(int(np.ceil(limit_s * rate_hz)) - 1, int(np.ceil(time_s * rate_hz)) - 1, -1):
+                belief = chain.knot(predict(belief, stop / rate_hz, passage.follower.motion))
+                rows.append(k)
+        belief = predict(belief, time_s, passage.follower.motion)
+        links = link(site, epoch.emitter, epoch.receiver)
+        asked = passage.follower.trusted(epoch)
+        belief, _, _ = update(belief, asked, links, np.isfinite(epoch.range_m))
+        own = [SIZE * who + i for who in np.flatnonzero(first.placed) for i in (0, 1)]
+        if belief.covariance[own, own].max() > BACK_SD_M**2:
+            break
+        belief = chain.knot(belief)
+        rows.append(-1 if rate_hz is not None else k)
+        limit_s = time_s
+    for k, smoothed in zip(reversed(rows), chain.back(), strict=True):
+        if k >= 0:
+            yield k, smoothed
+
+
+def estimates(belief: Belief, follower: Follower) -> list[Estimate]:
+    """Return what a smoothed belief says of each vehicle."""
+    return [estimate(belief, follower.site, int(who), "smoothed") for who in np.flatnonzero(belief.placed)]
