@@ -248,8 +248,8 @@ class Fix:
     vehicle : str
     status : "ok" or why not; ``remedy`` says in one sentence what would help
     states : tuple of str
-        Names of the rows of ``covariance``, among x, y, z, yaw, clock, vx, vy, vz and, of a body that tilts, roll, pitch
-        and the rates of the three angles.
+        Names of the rows of ``covariance``, among x, y, z, yaw, clock, vx, vy, vz and, of a body that tilts, roll,
+        pitch and the rates of the three angles.
     position_m : float64 (3,) or None
         Of the vehicle's origin; None unless the status is "ok" or "inconsistent".
     velocity_mps : float64 (3,) or None
@@ -307,7 +307,8 @@ class Estimate:
     """The track of one vehicle at one instant: what its filter believes.
 
     ``states`` names the rows of ``covariance`` (x, y, z, yaw, clock, vx, vy, vz, roll, pitch as estimated); the pose is
-    that of the vehicle's origin, roll and pitch None where it is taken to stand upright. ``source``: "fix" or "fused" where a measurement entered, "predicted" where none did.
+    that of the vehicle's origin, roll and pitch None where it is taken to stand upright. ``source``: "fix" or "fused"
+    where a measurement entered, "predicted" where none did.
     """
 
     time_s: float

@@ -90,8 +90,6 @@ def judged(
         remedy = "a range is wrong, but which cannot be told; bring more beacons in reach"
     rivals = [s for s in found[1:] if s.chi2 < best.chi2 + AMBIGUOUS_CHI2 * inflation]
     best, mirror, undecided = _tell_apart(best, rivals, bounds_m, epoch, rows[kept])
-    between = mirror is not None and not undecided and solver.level_m is None
-    between = between and (bounds_m is None or _inside(mirror, bounds_m))
     mirror_m = None if mirror is None else mirror.position_m.copy()
     if undecided:
         text = "two positions or headings fit alike; state the room's bounds_m or the vehicle's z_m, or move one beacon"
@@ -104,7 +102,7 @@ def judged(
     hpl_m = vpl_m = None
     if status == "ok":
         hpl_m, vpl_m = solver.protection(kept, best, [s for s in found if s is not best], bounds_m)
-    if mirror is not None and between:
+    if mirror is not None and solver.level_m is None and (bounds_m is None or _inside(mirror, bounds_m)):
         best, covariance = _between(best, mirror, covariance, solver.components)
     states = tuple(POSE[i] for i in solver.components) + ("clock",) * solver.clock
     used = np.zeros(len(epoch), bool)
@@ -182,16 +180,21 @@ def _close(best: Solution, other: Solution, epoch: RangeEpoch, kept: NDArray[np.
 def _between(
     best: Solution, mirror: Solution, covariance: Floats, components: tuple[int, ...]
 ) -> tuple[Solution, Floats]:
-    """Return the middle of two solutions just above each other: what stands out of their plane of the one lies behind
-    it of the other, so half their difference is the deviation of the height, and of roll and pitch.
+    """Return the middle of two solutions just above each other; half their distance is the height's deviation.
+
+    Those of a body that tilts differ in attitude too: the middle of both, with the covariance of their mixture.
     """
     state, wider = best.state.copy(), covariance.copy()
-    for j in (2, ROLL, PITCH):
-        if j in components:
-            half, k = (best.state[j] - mirror.state[j]) / 2, components.index(j)
-            state[j] -= half
-            wider[k, :] = wider[:, k] = 0.0
-            wider[k, k] = half**2 + covariance[k, k]
+    if ROLL in components:
+        half = (best.state - mirror.state) / 2
+        half[[YAW, ROLL, PITCH]] = [_angle(2 * angle) / 2 for angle in half[[YAW, ROLL, PITCH]]]
+        own = list(components)
+        wider[: len(own), : len(own)] += np.outer(half[own], half[own])
+        return replace(best, state=state - half), wider
+    half_m = (best.state[2] - mirror.state[2]) / 2
+    state[2] -= half_m
+    wider[2, :] = wider[:, 2] = 0.0
+    wider[2, 2] = half_m**2 + covariance[2, 2]
     return replace(best, state=state), wider
 
 

@@ -116,7 +116,7 @@ def look(rows, c, clock, index, state, kept, residual):
         residual[i] = measured[i] - value[i]
     chosen = np.empty(len(index), np.int64)
     for j in index:
-        if j <= YAW or j == ROLL or j == PITCH or j == CLOCK:
+        if j <= YAW or j in (ROLL, PITCH, CLOCK):
             chosen[places] = j
             places += 1
             in_space |= j == 2

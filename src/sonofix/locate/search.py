@@ -20,8 +20,11 @@ YAW_STARTS = 12
 LEAN_STARTS, LEAN_RAD = 6, 0.7
 """Ways that a body which tilts is tried leant over, and how far."""
 
-MOST = 2 * (MOST_STARTS + 1)
-"""Solutions there may be: from each start and a mirror image, by two headings."""
+MOST = 2 * (MOST_STARTS + 1) + LEAN_STARTS
+"""Solutions there may be: from each start and a mirror image, by two headings; and leant over from the best of them."""
+
+REDUNDANT = 3
+"""A body that tilts has one attitude that fits where rows are so many times the unknowns; else others are sought."""
 
 NEARLY_FLAT = 0.3
 """Anchors that spread less across than this share of their widest spread may have nearly a mirror solution."""
@@ -88,6 +91,15 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
                 if tilts:
                     _least_turned(state)
                 found = _insert(states, chi2s, found, state, chi2)
+    for lean in range(LEAN_STARTS if tilts and found and m < REDUNDANT * len(index) else 0):
+        for j in range(ALONE):
+            state[j] = states[0, j]
+        way = lean * (2 * np.pi / LEAN_STARTS)
+        state[ROLL], state[PITCH] = LEAN_RAD * np.cos(way), LEAN_RAD * np.sin(way)
+        chi2, rests = descend(rows, c, clock, whiten, index, states[:found], STEPS, state, plain, miss, jacobian)
+        if rests:
+            _least_turned(state)
+            found = _insert(states, chi2s, found, state, chi2)
     kept = 0
     for i in range(found):
         new = True
@@ -226,7 +238,7 @@ def room(count, m):
 
 @numba.njit(cache=True, error_model="numpy")
 def keep(rows, covariance, choice, before, kept, part):
-    """Fill ``kept`` and ``part`` (m, m) with some of the rows and their covariance, ``before``: so many `beforehand`."""
+    """Fill ``kept`` and ``part`` (m, m) with some of the rows, ``before`` of them `beforehand`, and covariance."""
     ends, dt, measured = rows
     kept_ends, kept_dt, kept_measured = kept
     n, count = len(dt), len(choice)

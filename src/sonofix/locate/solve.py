@@ -32,8 +32,8 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
     Parameters
     ----------
     rows : tuple
-        ``ends`` as `geometry.expected` takes them, ``dt`` (n,), and what was measured (m,): ranges, then rates if any, then 0 for
-        each of `beforehand`.
+        ``ends`` as `geometry.expected` takes them, ``dt`` (n,), and what was measured (m,): ranges, then rates if any,
+        then 0 for each of `beforehand`.
     whiten : float64 (m, m)
         Lower triangular.
     index : int64 (k,)
