@@ -389,7 +389,14 @@ def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tup
     range_m, rate_mps : float64 (n,)
     by_range, by_rate : float64 (n, vehicles, SIZE)
         Derivatives by ``pose``.
+
+    Raises
+    ------
+    ValueError
+        If a pose does not have the components of ``POSE``.
     """
+    if np.shape(pose)[1:] != (SIZE,):
+        raise ValueError(f"pose has shape {np.shape(pose)}; give a row of {SIZE} components, POSE, a vehicle")
     n, shape = len(links), (len(links), len(pose), SIZE)
     value, derivative = rows_at(links, np.append(pose, np.zeros(2)), dt, sound_speed_mps, False, True)
     return value[:n], value[n:], derivative[:n, :-2].reshape(shape), derivative[n:, :-2].reshape(shape)
