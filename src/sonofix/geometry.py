@@ -29,9 +29,9 @@ CLOCK = SIZE
 ALONE = SIZE + 2
 """Where the clock's offset stands in the state of one vehicle, and how many components that has with its drift."""
 
-TILT_SD_RAD = 0.3
-"""How far a body tilts whose site file does not say, one sigma of roll and of pitch: 17°, as things that fly, float or
-hang do."""
+TILT_SD_RAD = 0.15
+"""How far a body tilts whose site file does not say, one sigma of roll and of pitch: 9°, as things that fly, float or
+hang do; now and then twice and thrice that."""
 
 SAME_ARM_M = 1e-3
 """Lever arms that differ by less, seen from above, are one."""

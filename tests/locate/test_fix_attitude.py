@@ -7,6 +7,7 @@ import pytest
 
 from locate.made_epochs import BOUNDS, HALL, make_epoch, make_site, rows_of, shifted
 from locate.made_tilts import CORNERS, TETRAHEDRON, Flight, flight
+from sonofix.geometry import TILT_SD_RAD
 from sonofix.locate.fix import fix
 from sonofix.records import Fix, Floats
 from sonofix.site import Site
@@ -88,10 +89,12 @@ def test_a_plane_of_beacons_mirrors_a_plane_of_microphones(rng: np.random.Genera
 def test_where_too_few_ends_are_heard_the_tilt_stays_doubtful(ends: int, rng: np.random.Generator) -> None:
     site = make_site(HALL, arms_m=CORNERS, bounds_m=BOUNDS)
     squared = []
-    for _ in range(25):
-        truth = flight(rng)
+    for _ in range(30):
+        truth = flight(rng, TILT_SD_RAD)
         epoch = make_epoch(site, truth, sd_m=1e-3, rng=rng)
         found = fix(rows_of(epoch, [i for i, r in enumerate(epoch.receiver) if int(r[1]) < ends]), site, "v")
+        if found.status == "ambiguous":
+            continue
         assert found.status == "ok"
         assert found.position_m is not None
         assert found.covariance is not None
@@ -101,8 +104,9 @@ def test_where_too_few_ends_are_heard_the_tilt_stays_doubtful(ends: int, rng: np
         if ends == 2:
             # about the line of the two, nothing is told
             assert max(found.sd("roll") or 0.0, found.sd("pitch") or 0.0) > 0.05
-    # of 25 sums of three squares the mean lies below 5 with 1 − 1e-4; the covariance may be too wide, never too narrow
-    assert np.mean(squared) < 5.0
+    # the mean of 25 sums of three squares lies below 5.4 but for 2e-5; covariances may be too wide, not too narrow
+    assert len(squared) >= 25
+    assert np.mean(squared) < 5.4
 
 
 def test_few_rows_are_ambiguous_rather_than_wrong(rng: np.random.Generator) -> None:

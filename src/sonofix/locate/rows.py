@@ -22,7 +22,7 @@ UNKNOWN_SPEED_MPS = 1.0
 """Deviation of the velocity (from 0) where no range rates tell of it: a walk."""
 
 ROCKING_RADPS = 2.0
-"""How fast a body that tilts rocks, one sigma: 0.3 rad to and fro within a second."""
+"""How fast a body that tilts rocks, one sigma."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

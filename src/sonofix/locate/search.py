@@ -20,8 +20,8 @@ YAW_STARTS = 12
 LEAN_STARTS, LEAN_RAD = 6, 0.7
 """Ways that a body which tilts is tried leant over, and how far."""
 
-MOST = 2 * (MOST_STARTS + 1) + LEAN_STARTS
-"""Solutions there may be: from each start and a mirror image, by two headings; and leant over from the best of them."""
+MOST = (2 + LEAN_STARTS) * (MOST_STARTS + 1) + LEAN_STARTS
+"""Solutions there may be: from each start and a mirror image, by two headings and leant over; and so from the best."""
 
 REDUNDANT = 3
 """A body that tilts has one attitude that fits where rows are so many times the unknowns; else others are sought."""
@@ -66,6 +66,7 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
         tilts |= j == ROLL
     begins, state, attitudes = np.empty((MOST_STARTS + 1, 4)), np.empty(ALONE), np.zeros((2, 3))
     count, found = begin(anchors, measured[:n], flat, level_m, clock, begins), 0
+    scarce = tilts and m < REDUNDANT * len(index)
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, len(index)))
     for b in range(MOST_STARTS + 1):
         if b > count or (b == count and not found):
@@ -79,11 +80,13 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
                 break
         if turns:
             _attitudes(rows, c, clock, whiten, begins[b], tilts, attitudes)
-        for k in range(2 if turns else 1):
+        for k in range((2 + LEAN_STARTS if scarce else 2) if turns else 1):
             state[:] = 0.0
             for axis in range(3):
                 state[axis] = begins[b, axis]
-            state[YAW], state[ROLL], state[PITCH] = attitudes[k]
+            state[YAW], state[ROLL], state[PITCH] = attitudes[k if k < 2 else 0]
+            if k >= 2:
+                _lean(k - 2, state)
             state[CLOCK] = begins[b, 3]
             known = states[:found]
             chi2, rests = descend(rows, c, clock, whiten, index, known, STEPS, state, plain, miss, jacobian)
@@ -91,11 +94,10 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
                 if tilts:
                     _least_turned(state)
                 found = _insert(states, chi2s, found, state, chi2)
-    for lean in range(LEAN_STARTS if tilts and found and m < REDUNDANT * len(index) else 0):
+    for lean in range(LEAN_STARTS if scarce and found else 0):
         for j in range(ALONE):
             state[j] = states[0, j]
-        way = lean * (2 * np.pi / LEAN_STARTS)
-        state[ROLL], state[PITCH] = LEAN_RAD * np.cos(way), LEAN_RAD * np.sin(way)
+        _lean(lean, state)
         chi2, rests = descend(rows, c, clock, whiten, index, states[:found], STEPS, state, plain, miss, jacobian)
         if rests:
             _least_turned(state)
@@ -111,6 +113,13 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
             chi2s[kept] = misfit(rows, c, clock, whiten, index, states[kept], plain, miss, jacobians[kept])
             kept += 1
     return kept
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lean(lean, state):
+    """Lean a state over, in place, one of `LEAN_STARTS` ways."""
+    way = lean * (2 * np.pi / LEAN_STARTS)
+    state[ROLL], state[PITCH] = LEAN_RAD * np.cos(way), LEAN_RAD * np.sin(way)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -179,8 +188,8 @@ def _attitudes(rows, c, clock, whiten, place, tilts, out):
         out[k, 0], out[k, 1], out[k, 2] = y * turn, 0.0, 0.0
         least = misfits[y]
         for lean in range(LEAN_STARTS if tilts else 0):
-            way = lean * (2 * np.pi / LEAN_STARTS)
-            state[YAW], state[ROLL], state[PITCH] = y * turn, LEAN_RAD * np.cos(way), LEAN_RAD * np.sin(way)
+            state[YAW] = y * turn
+            _lean(lean, state)
             expected(ends, state, dt, c, clock, value, derivative)
             square = _square(measured, value, whiten)
             if square < least:

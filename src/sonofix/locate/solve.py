@@ -8,6 +8,9 @@ import numpy as np
 from sonofix.geometry import ALONE, PITCH, ROLL, SIZE, YAW, expected
 from sonofix.locate.dense import factor, substitute
 
+UNUSUAL = 3.0
+"""Deviations that a tilt counts for at most."""
+
 SAME = 1e-3
 """A descent that comes within so many metres and radians of where an earlier one came to rest ends there."""
 
@@ -16,7 +19,8 @@ SAME = 1e-3
 def beforehand(index):
     """How many unknowns are roughly known before anything is heard: angles of tilt and their rates.
 
-    Each has a row of its own behind those measured, which says that it is 0 with its deviation.
+    Each has a row of its own behind those measured, which says that it is 0 with its deviation. What is many of these
+    off is as unlikely as what is `UNUSUAL`: that a body leans over is no fault of a range.
     """
     count = 0
     for j in index:
@@ -52,9 +56,11 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
     expected(ends, state, dt, c, clock, plain[:last], derivative[:last])
     for j in index:
         if ROLL <= j < SIZE:
-            plain[last] = state[j]
+            most = UNUSUAL / whiten[last, last]
+            share = np.tanh(state[j] / most)
+            plain[last] = most * share
             derivative[last] = 0.0
-            derivative[last, j] = 1.0
+            derivative[last, j] = 1.0 - share**2
             last += 1
     chi2 = 0.0
     for i in range(m):
