@@ -7,15 +7,29 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
-from sonofix.geometry import POSE, Links, from_arm, link, model, open_arms, row_times, rows_at, turning
+from sonofix.geometry import (
+    POSE,
+    SIZE,
+    TILT_SD_RAD,
+    Links,
+    from_arm,
+    link,
+    model,
+    open_arms,
+    row_times,
+    rows_at,
+    tilting,
+    turning,
+)
 from sonofix.records import Floats
 from sonofix.site import Site
 
 SPEED = 343.0
-STILL = np.zeros(8)
-DRIVING = np.array([3.0, -2.0, 0.4, 0.7, 1.6, -1.1, 0.2, 0.9])
-CROSSING = np.array([-4.0, 5.0, 1.1, -2.0, -0.8, 1.7, -0.3, -0.6])
+UPRIGHT = [0.0] * 4
+DRIVING = np.array([3.0, -2.0, 0.4, 0.7, 1.6, -1.1, 0.2, 0.9, 0.4, -0.3, 0.5, -0.8])
+CROSSING = np.array([-4.0, 5.0, 1.1, -2.0, -0.8, 1.7, -0.3, -0.6, *UPRIGHT])
 
 # name: emitter (vehicle, point), receiver (vehicle, point); −1 is fixed, points of mounted ends are lever arms
 CASES = {
@@ -36,12 +50,12 @@ def links_of(*cases: tuple[tuple[int, tuple], tuple[int, tuple]]) -> Links:
 
 
 def place(vehicle: int, point: tuple, poses: Floats, time_s: float) -> Floats:
-    """Origin + R(yaw) arm at an instant, written with a complex number in place of a rotation matrix."""
+    """Origin + R arm at an instant, by another library's rotations."""
     if vehicle < 0:
         return np.array(point)
-    x, y, z, yaw, vx, vy, vz, yaw_rate = poses[vehicle]
-    arm = complex(point[0], point[1]) * np.exp(1j * (yaw + yaw_rate * time_s))
-    return np.array([x + vx * time_s + arm.real, y + vy * time_s + arm.imag, z + vz * time_s + point[2]])
+    angles, rates = poses[vehicle, [3, 9, 8]], poses[vehicle, [7, 11, 10]]
+    turn = Rotation.from_euler("ZYX", angles + rates * time_s)
+    return poses[vehicle, :3] + poses[vehicle, 4:7] * time_s + turn.apply(point)
 
 
 def heard_range_m(emitter: tuple[int, tuple], receiver: tuple[int, tuple], poses: Floats, time_s: float) -> float:
@@ -73,7 +87,7 @@ def test_rate_is_the_derivative_of_the_heard_range(case: str, time_s: float) -> 
 
 
 def test_a_receding_receiver_has_a_positive_rate() -> None:
-    pose = np.array([[10.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])
+    pose = np.array([[10.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, *UPRIGHT]])
     links = links_of(((-1, (0.0, 0.0, 0.0)), (0, (0.0, 0.0, 0.0))))
     range_m, rate, *_ = model(links, pose, np.array([0.5]), SPEED)
     assert range_m[0] == pytest.approx(11.0, abs=1e-12)
@@ -82,7 +96,7 @@ def test_a_receding_receiver_has_a_positive_rate() -> None:
 
 def test_a_receding_emitter_is_heard_nearer_than_it_is() -> None:
     # r = x + v (t − r/c)  →  r = (x + v t) / (1 + v/c), and its derivative v / (1 + v/c)
-    pose = np.array([[10.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])
+    pose = np.array([[10.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, *UPRIGHT]])
     links = links_of(((0, (0.0, 0.0, 0.0)), (-1, (0.0, 0.0, 0.0))))
     range_m, rate, *_ = model(links, pose, np.array([0.5]), SPEED)
     assert range_m[0] == pytest.approx(11.0 / (1 + 2.0 / SPEED), abs=2e-8)
@@ -91,14 +105,14 @@ def test_a_receding_emitter_is_heard_nearer_than_it_is() -> None:
 
 def test_a_lever_arm_turns_with_the_yaw() -> None:
     # a vehicle at the origin looking north: one metre forward is one metre north
-    pose = np.array([[0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]])
+    pose = np.array([[0.0, 0.0, 0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0, *UPRIGHT]])
     links = links_of(((-1, (0.0, 5.0, 0.0)), (0, (1.0, 0.0, 0.0))))
     assert model(links, pose, np.zeros(1), SPEED)[0][0] == pytest.approx(4.0, abs=1e-12)
 
 
 def test_a_turning_arm_moves_although_its_vehicle_stands() -> None:
     # ω × arm: at 2 rad/s a point one metre to the left moves backwards at 2 m/s
-    pose = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0]])
+    pose = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0, *UPRIGHT]])
     links = links_of(((-1, (10.0, 1.0, 0.0)), (0, (0.0, 1.0, 0.0))))
     assert model(links, pose, np.zeros(1), SPEED)[1][0] == pytest.approx(2.0, abs=1e-12)
 
@@ -122,7 +136,7 @@ def test_fixed_ends_have_no_derivatives() -> None:
 
 def test_ends_at_one_place_give_finite_numbers() -> None:
     links = links_of(((-1, (1.0, 2.0, 3.0)), (0, (0.0, 0.0, 0.0))))
-    pose = np.array([[1.0, 2.0, 3.0, 0.0, 0.5, 0.5, 0.0, 0.0]])
+    pose = np.array([[1.0, 2.0, 3.0, 0.0, 0.5, 0.5, 0.0, 0.0, *UPRIGHT]])
     results = model(links, pose, np.zeros(1), SPEED)
     assert all(np.isfinite(r).all() for r in results)
     assert results[0][0] == pytest.approx(0.0, abs=1e-5)
@@ -132,7 +146,7 @@ def test_no_rows_give_empty_arrays() -> None:
     links = links_of(CASES["moving receiver"]).rows(np.zeros(0, int))
     range_m, rate, by_range, by_rate = model(links, POSES, np.zeros(0), SPEED)
     assert range_m.shape == rate.shape == (0,)
-    assert by_range.shape == by_rate.shape == (0, 2, 8)
+    assert by_range.shape == by_rate.shape == (0, 2, SIZE)
 
 
 # --- the plain twin of the kernel -------------------------------------------------------------------------------------
@@ -140,15 +154,21 @@ def test_no_rows_give_empty_arrays() -> None:
 
 def twin_ends(vehicle: Floats, point: Floats, pose: Floats, dt: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     state = np.where((vehicle >= 0)[:, None], pose[vehicle], 0.0)
-    yaw = state[:, 3] + state[:, 7] * dt
-    cos, sin = np.cos(yaw), np.sin(yaw)
+    angles = state[:, [3, 9, 8]] + state[:, [7, 11, 10]] * dt[:, None]
     mounted = (vehicle >= 0)[:, None]
-    x, y, z = point.T
-    arm = np.column_stack([cos * x - sin * y, sin * x + cos * y, z]) * mounted
-    by_yaw = np.column_stack([-arm[:, 1], arm[:, 0], np.zeros(len(x))])
+    whole = Rotation.from_euler("ZYX", angles)
+    heading = Rotation.from_euler("Z", angles[:, :1])
+    # the axes that yaw, pitch and roll turn about; each turns those after it
+    axes = [np.tile([0.0, 0.0, 1.0], (len(point), 1)), heading.apply([0.0, 1.0, 0.0]), whole.apply([1.0, 0.0, 0.0])]
+    arm = whole.apply(point) * mounted
+    by = [np.cross(axis, arm) for axis in axes]
+    rates = state[:, [7, 11, 10]].T[:, :, None]
+    twice = [
+        sum(rates[j] * np.cross(axes[min(i, j)], np.cross(axes[max(i, j)], arm)) for j in range(3)) for i in range(3)
+    ]
     here = np.where(mounted, state[:, :3] + state[:, 4:7] * dt[:, None] + arm, point)
-    flat = np.column_stack([arm[:, 0], arm[:, 1], np.zeros(len(x))])
-    return here, state[:, 4:7] + state[:, 7:8] * by_yaw, by_yaw, -state[:, 7:8] * flat
+    moves = state[:, 4:7] + sum(rate * moved for rate, moved in zip(rates, by, strict=True))
+    return here, moves, np.stack(by, axis=-1), np.stack(twice, axis=-1)
 
 
 def twin_model(links: Links, pose: Floats, dt: Floats) -> tuple[Floats, Floats, Floats, Floats]:
@@ -168,7 +188,7 @@ def twin_model(links: Links, pose: Floats, dt: Floats) -> tuple[Floats, Floats, 
     relative = receiver_v - emitter_v
     closing = np.sum(unit * relative, axis=1)
     across = (relative - closing[:, None] * unit) / range_m[:, None]
-    by_range, by_rate = np.zeros((2, len(links), len(pose), 8))
+    by_range, by_rate = np.zeros((2, len(links), len(pose), SIZE))
     for i in range(len(links)):
         for vehicle, sign, t, turn, v_turn in (
             (links.receiver_vehicle[i], 1.0, dt[i], receiver_turn[i], receiver_v_turn[i]),
@@ -177,9 +197,13 @@ def twin_model(links: Links, pose: Floats, dt: Floats) -> tuple[Floats, Floats, 
             if vehicle < 0:
                 continue
             k, u, a = sign * lag[i], unit[i], across[i]
-            rate_turn = a @ turn + u @ v_turn
-            by_range[i, vehicle] += k * np.array([*u, u @ turn, *(t * u), t * (u @ turn)])
-            by_rate[i, vehicle] += k * np.array([*a, rate_turn, *(u + t * a), u @ turn + t * rate_turn])
+            yaw, pitch, roll = u @ turn
+            by_range[i, vehicle] += k * np.array([*u, yaw, *(t * u), t * yaw, roll, pitch, t * roll, t * pitch])
+            rates = a @ turn + u @ v_turn
+            yaw_rate, pitch_rate, roll_rate = u @ turn + t * rates
+            by_rate[i, vehicle] += k * np.array(
+                [*a, rates[0], *(u + t * a), yaw_rate, rates[2], rates[1], roll_rate, pitch_rate]
+            )
     return range_m, lag * closing, by_range, by_rate
 
 
@@ -190,7 +214,8 @@ def test_kernel_matches_its_plain_twin(rng: np.random.Generator) -> None:
         points = rng.uniform(-9, 9, (2, n, 3))
         points[vehicles >= 0] *= 0.03
         links = Links(vehicles[0], points[0], vehicles[1], points[1], np.zeros(n))
-        poses = np.column_stack([rng.uniform(-9, 9, (3, 3)), rng.uniform(-4, 4, 3), rng.uniform(-2, 2, (3, 4))])
+        poses = np.column_stack([rng.uniform(-9, 9, (3, 3)), rng.uniform(-4, 4, 3), rng.uniform(-2, 2, (3, 8))])
+        poses[2, 8:] = 0.0
         dt = rng.uniform(-0.2, 0.2, n)
         # four rounds of contraction by v/c ≤ 4.3/343 from at most 31 m leave 8e-7 m; derivatives follow in proportion
         for built, plain in zip(model(links, poses, dt, SPEED), twin_model(links, poses, dt), strict=True):
@@ -206,9 +231,9 @@ def test_rows_at_stacks_ranges_and_rates_and_adds_the_clock(clock: bool, rates: 
     range_m, rate, by_range, by_rate = model(links, POSES, times, SPEED)
     offset, drift = (3.5, 0.25) if clock else (0.0, 0.0)
     np.testing.assert_array_equal(value, np.concatenate([range_m + offset, rate + drift])[: n * (1 + rates)])
-    whole = np.zeros((2 * n, 18))
-    whole[:n, :16], whole[n:, :16] = by_range.reshape(n, -1), by_rate.reshape(n, -1)
-    whole[:n, 16] = whole[n:, 17] = clock
+    whole, poses = np.zeros((2 * n, 2 * SIZE + 2)), slice(0, 2 * SIZE)
+    whole[:n, poses], whole[n:, poses] = by_range.reshape(n, -1), by_rate.reshape(n, -1)
+    whole[:n, -2] = whole[n:, -1] = clock
     np.testing.assert_array_equal(derivative, whole[: n * (1 + rates)])
 
 
@@ -290,6 +315,39 @@ def test_a_lone_end_tells_no_heading_and_leaves_its_arm_open() -> None:
     # two ends above each other are as one; a vehicle without ends has nothing open
     assert turning(mast).tolist() == [False, False]
     np.testing.assert_array_equal(open_arms(mast), [[0.2, 0.1], [0.0, 0.0]])
+
+
+CORNERS = ((0.3, 0.0, 0.1), (-0.2, 0.2, 0.1), (-0.2, -0.2, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "arms", "tilt_sd_rad"),
+    [
+        ({}, CORNERS, TILT_SD_RAD),
+        ({"z_m": 0.0}, CORNERS, 0.0),
+        ({}, CORNERS[:2], 0.0),
+        ({}, [(0.1 * k, 0.2 * k, 0.05 * k) for k in range(4)], 0.0),
+        ({"tilt_sd_rad": 0.0}, CORNERS, 0.0),
+        ({"tilt_sd_rad": 0.1, "z_m": 0.0}, CORNERS[:2], 0.1),
+    ],
+    ids=["three", "known level", "two", "on a line", "stated upright", "stated"],
+)
+def test_a_body_tilts_where_its_ends_can_tell_and_nothing_else_is_stated(
+    vehicle: dict, arms: tuple, tilt_sd_rad: float
+) -> None:
+    site = Site.model_validate(
+        {
+            "vehicle": [{"id": "a"} | vehicle],
+            "beacon": [{"id": "wall", "position_m": [1.0, 2.0, 3.0]}],
+            "microphone": [{"id": f"M{i}", "vehicle": "a", "lever_arm_m": arm} for i, arm in enumerate(arms)],
+        }
+    )
+    assert tilting(site).tolist() == [tilt_sd_rad]
+
+
+def test_a_pose_without_its_tilt_is_refused() -> None:
+    with pytest.raises(ValueError, match="12 components"):
+        model(links_of(CASES["moving receiver"]), POSES[:, :8], np.zeros(1), SPEED)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 1.1, -2.5])

@@ -1,7 +1,8 @@
 """Range and range-rate models with their Jacobians, for any mix of fixed and mounted emitters and receivers.
 
 A row says that ``receiver`` heard at t what ``emitter`` sent at t − r/c: r = |p_receiver(t) − p_emitter(t − r/c)|.
-Vehicles move straight and turn evenly about a reference instant; a node's place is origin + R(yaw) lever arm.
+Vehicles move straight and turn evenly about a reference instant; a node's place is origin + R lever arm, with
+R = Rz(yaw) Ry(pitch) Rx(roll) as in `attitude`. One that stands upright has neither roll nor pitch.
 """
 
 from __future__ import annotations
@@ -15,10 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Floats
-from sonofix.site import Beacon, Microphone, Site
+from sonofix.site import Beacon, Microphone, Site, Vehicle
 
-POSE = ("x", "y", "z", "yaw", "vx", "vy", "vz", "yaw_rate")
-"""Components of one vehicle's motion state, in m, rad, m/s and rad/s."""
+POSE = ("x", "y", "z", "yaw", "vx", "vy", "vz", "yaw_rate", "roll", "pitch", "roll_rate", "pitch_rate")
+"""Components of one vehicle's motion state, in m, rad, m/s and rad/s; rates are those of the three angles."""
+
+SIZE = len(POSE)
+YAW, YAW_RATE, ROLL, PITCH, ROLL_RATE, PITCH_RATE = 3, 7, 8, 9, 10, 11
+"""Where they stand in it."""
+
+CLOCK = SIZE
+ALONE = SIZE + 2
+"""Where the clock's offset stands in the state of one vehicle, and how many components that has with its drift."""
+
+TILT_SD_RAD = 0.15
+"""How far a body tilts whose site file does not say, one sigma of roll and of pitch: 9°, as things that fly, float or
+hang do; now and then twice and thrice that."""
 
 SAME_ARM_M = 1e-3
 """Lever arms that differ by less, seen from above, are one."""
@@ -100,6 +113,7 @@ class _Roster:
     receivers: _Ends
     arms: Floats
     turns: NDArray[np.bool_]
+    tilt_sd_rad: Floats
 
 
 @lru_cache(maxsize=8)
@@ -113,7 +127,8 @@ def _roster(key: _Same) -> _Roster:
         turns[i] = len(flat) > 0 and bool(np.any(np.hypot(*(flat - flat[0]).T) >= SAME_ARM_M))
         if len(flat) and not turns[i]:
             arms[i] = flat[0]
-    arms.flags.writeable = turns.flags.writeable = False
+    tilt_sd_rad = np.array([_tilt_sd_rad(v, nodes) for v in site.vehicles], float)
+    arms.flags.writeable = turns.flags.writeable = tilt_sd_rad.flags.writeable = False
     left_out = np.vstack([np.column_stack([arms, np.zeros(len(arms))]), np.zeros((1, 3))])
 
     def ends(some: tuple[Beacon, ...] | tuple[Microphone, ...]) -> _Ends:
@@ -122,7 +137,17 @@ def _roster(key: _Same) -> _Roster:
         sd_m = np.array([n.position_sd_m if isinstance(n, Beacon) else 0.0 for n in some], float)
         return _Ends({n.id: i for i, n in enumerate(some)}, carrier, point - left_out[carrier], sd_m)
 
-    return _Roster(ends(site.beacons), ends(site.microphones), arms, turns)
+    return _Roster(ends(site.beacons), ends(site.microphones), arms, turns, tilt_sd_rad)
+
+
+def _tilt_sd_rad(vehicle: Vehicle, nodes: tuple[Beacon | Microphone, ...]) -> float:
+    """Deviation of roll and pitch as the site has it, else as what stands on a floor, or does not, has it."""
+    if vehicle.tilt_sd_rad is not None:
+        return vehicle.tilt_sd_rad
+    arms = np.array([n.lever_arm_m for n in nodes if n.vehicle == vehicle.id]).reshape(-1, 3)
+    if vehicle.z_m is not None or len(arms) < 3:
+        return 0.0
+    return TILT_SD_RAD if np.linalg.svd(arms - arms.mean(axis=0), compute_uv=False)[1] >= SAME_ARM_M else 0.0
 
 
 def open_arms(site: Site) -> Floats:
@@ -137,6 +162,15 @@ def open_arms(site: Site) -> Floats:
 def turning(site: Site) -> NDArray[np.bool_]:
     """Whether each vehicle's ends tell its heading (V,): they sit on more than one vertical line."""
     return _roster(_Same(site)).turns
+
+
+def tilting(site: Site) -> Floats:
+    """Deviation (V,) of each vehicle's roll and pitch before anything is heard; 0: it stands upright.
+
+    Where the site file does not say, a vehicle on a known level stands upright, and so does one whose ends are on one
+    line, which tell of no attitude; others tilt by `TILT_SD_RAD`.
+    """
+    return _roster(_Same(site)).tilt_sd_rad
 
 
 def from_arm(arm: Floats, velocity: Floats) -> tuple[Floats, float]:
@@ -176,30 +210,67 @@ def link(site: Site, emitters: tuple[str, ...], receivers: tuple[str, ...]) -> L
 
 @numba.njit(cache=True, error_model="numpy")
 def _place(vehicle, point, state, dt, out):
-    """Place, velocity and their derivatives by yaw of one end of a row: rows 0 to 3 of ``out`` (4, 3)."""
+    """Place, velocity, and their derivatives by yaw, roll and pitch of one end of a row: ``out`` (8, 3).
+
+    Rows 2 to 4 are those of the place, and of the velocity by the angles' rates; 5 to 7 those of the velocity.
+    """
     for axis in range(3):
         out[0, axis] = point[axis]
-        out[1, axis] = out[2, axis] = out[3, axis] = 0.0
+        for row in range(1, 8):
+            out[row, axis] = 0.0
     if vehicle < 0:
         return
-    at = 8 * vehicle
-    yaw_rate = state[at + 7]
-    east = north = 0.0
-    if point[0] != 0.0 or point[1] != 0.0:
-        yaw = state[at + 3] + yaw_rate * dt
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        east = cos * point[0] - sin * point[1]
-        north = sin * point[0] + cos * point[1]
+    at = SIZE * vehicle
     for axis in range(3):
         out[0, axis] = state[at + axis] + state[at + 4 + axis] * dt
         out[1, axis] = state[at + 4 + axis]
+    forward, left, up = point[0], point[1], point[2]
+    if forward == 0.0 and left == 0.0 and up == 0.0:
+        return
+    yaw_rate, roll_rate, pitch_rate = state[at + YAW_RATE], state[at + ROLL_RATE], state[at + PITCH_RATE]
+    yaw = state[at + YAW] + yaw_rate * dt
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    roll, pitch = state[at + ROLL] + roll_rate * dt, state[at + PITCH] + pitch_rate * dt
+    cos_pitch, sin_pitch = 1.0, 0.0
+    if roll != 0.0:
+        cos_roll, sin_roll = np.cos(roll), np.sin(roll)
+        left, up = cos_roll * left - sin_roll * up, sin_roll * left + cos_roll * up
+    # before the yaw: the arm, and what roll and pitch move of it
+    roll_x, roll_y, roll_z = 0.0, -up, left
+    if pitch != 0.0:
+        cos_pitch, sin_pitch = np.cos(pitch), np.sin(pitch)
+        roll_x, roll_z = sin_pitch * left, cos_pitch * left
+        forward, up = cos_pitch * forward + sin_pitch * up, cos_pitch * up - sin_pitch * forward
+    east, north = cos * forward - sin * left, sin * forward + cos * left
     out[0, 0] += east
     out[0, 1] += north
-    out[0, 2] += point[2]
+    out[0, 2] += up
     out[2, 0], out[2, 1] = -north, east
-    out[1, 0] -= yaw_rate * north
-    out[1, 1] += yaw_rate * east
-    out[3, 0], out[3, 1] = -yaw_rate * east, -yaw_rate * north
+    out[3, 0], out[3, 1], out[3, 2] = cos * roll_x - sin * roll_y, sin * roll_x + cos * roll_y, roll_z
+    out[4, 0], out[4, 1], out[4, 2] = cos * up, sin * up, -forward
+    if yaw_rate == 0.0 and roll_rate == 0.0 and pitch_rate == 0.0:
+        return
+    for axis in range(3):
+        out[5, axis] = yaw_rate * out[2, axis] + roll_rate * out[3, axis] + pitch_rate * out[4, axis]
+        out[1, axis] += out[5, axis]
+    out[5, 0], out[5, 1], out[5, 2] = -out[5, 1], out[5, 0], 0.0
+    # second derivatives: an angle's axis times what an angle whose axis it turns has moved
+    for row in (3, 4):
+        out[row + 3, 0] -= yaw_rate * out[row, 1]
+        out[row + 3, 1] += yaw_rate * out[row, 0]
+    if roll_rate != 0.0 or pitch_rate != 0.0:
+        _turn(pitch_rate, -sin, cos, 0.0, out[3], out[6])
+        _turn(roll_rate, cos_pitch * cos, cos_pitch * sin, -sin_pitch, out[3], out[6])
+        _turn(pitch_rate, -sin, cos, 0.0, out[4], out[7])
+        _turn(roll_rate, -sin, cos, 0.0, out[3], out[7])
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _turn(rate, x, y, z, arm, out):
+    """Add to ``out`` (3,) what a turn about an axis moves of ``arm`` (3,)."""
+    out[0] += rate * (y * arm[2] - z * arm[1])
+    out[1] += rate * (z * arm[0] - x * arm[2])
+    out[2] += rate * (x * arm[1] - y * arm[0])
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -212,7 +283,7 @@ def expected(ends, state, dt, c, clock, value, derivative):
     ----------
     ends : tuple
         ``emitter_vehicle, emitter_point, receiver_vehicle, receiver_point`` of `Links`, n rows.
-    state : float64 (8 V + 2,)
+    state : float64 (SIZE V + 2,)
         Each vehicle's ``POSE``, then the offset (m) and drift (m/s) of the clock that ranges share, if ``clock``.
     dt : float64 (n,)
         When each row was heard, from the instant the state belongs to.
@@ -220,10 +291,10 @@ def expected(ends, state, dt, c, clock, value, derivative):
         Sound speed.
     value : float64 (m,), out
         Ranges and then, where it is m = 2 n long, range rates.
-    derivative : float64 (m, 8 V + 2), out
+    derivative : float64 (m, SIZE V + 2), out
     """
     emitter_vehicle, emitter_point, receiver_vehicle, receiver_point = ends
-    here, there = np.empty((4, 3)), np.empty((4, 3))
+    here, there = np.empty((8, 3)), np.empty((8, 3))
     unit, across = np.empty(3), np.empty(3)
     n, last = len(dt), len(state) - 1
     rates = len(value) > n
@@ -266,31 +337,36 @@ def expected(ends, state, dt, c, clock, value, derivative):
             vehicle = receiver_vehicle[i] if end == 0 else emitter_vehicle[i]
             if vehicle < 0:
                 continue
-            at = 8 * vehicle
+            at = SIZE * vehicle
             k = lag if end == 0 else -lag
             when = dt[i] if end == 0 else sent
             turned = here if end == 0 else there
-            turn = 0.0
-            rate_turn = 0.0
             for axis in range(3):
-                turn += unit[axis] * turned[2, axis]
-                rate_turn += across[axis] * turned[2, axis] + unit[axis] * turned[3, axis]
                 derivative[i, at + axis] += k * unit[axis]
                 derivative[i, at + 4 + axis] += k * when * unit[axis]
-            derivative[i, at + 3] += k * turn
-            derivative[i, at + 7] += k * when * turn
-            if rates:
-                for axis in range(3):
+                if rates:
                     derivative[n + i, at + axis] += k * across[axis]
                     derivative[n + i, at + 4 + axis] += k * (unit[axis] + when * across[axis])
-                derivative[n + i, at + 3] += k * rate_turn
-                derivative[n + i, at + 7] += k * (turn + when * rate_turn)
+            for angle in range(3):
+                by, by_rate = at + YAW, at + YAW_RATE
+                if angle > 0:
+                    by, by_rate = at + ROLL + angle - 1, at + ROLL_RATE + angle - 1
+                turn = 0.0
+                rate_turn = 0.0
+                for axis in range(3):
+                    turn += unit[axis] * turned[2 + angle, axis]
+                    rate_turn += across[axis] * turned[2 + angle, axis] + unit[axis] * turned[5 + angle, axis]
+                derivative[i, by] += k * turn
+                derivative[i, by_rate] += k * when * turn
+                if rates:
+                    derivative[n + i, by] += k * rate_turn
+                    derivative[n + i, by_rate] += k * (turn + when * rate_turn)
 
 
 def rows_at(
     links: Links, state: Floats, dt: Floats, sound_speed_mps: float, clock: bool, rates: bool
 ) -> tuple[Floats, Floats]:
-    """Run `expected` into new arrays: what rows would show (m,) and its derivative (m, 8 V + 2)."""
+    """Run `expected` into new arrays: what rows would show (m,) and its derivative (m, SIZE V + 2)."""
     m = len(dt) * (2 if rates else 1)
     value, derivative = np.empty(m), np.empty((m, len(state)))
     expected(links.ends, state, dt, float(sound_speed_mps), clock, value, derivative)
@@ -303,7 +379,7 @@ def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tup
     Parameters
     ----------
     links : Links, n rows
-    pose : float64 (vehicles, 8)
+    pose : float64 (vehicles, SIZE)
         Each vehicle's ``POSE`` at the reference instant.
     dt : float64 (n,)
         When each row was heard, from the reference instant.
@@ -311,10 +387,17 @@ def model(links: Links, pose: Floats, dt: Floats, sound_speed_mps: float) -> tup
     Returns
     -------
     range_m, rate_mps : float64 (n,)
-    by_range, by_rate : float64 (n, vehicles, 8)
+    by_range, by_rate : float64 (n, vehicles, SIZE)
         Derivatives by ``pose``.
+
+    Raises
+    ------
+    ValueError
+        If a pose does not have the components of ``POSE``.
     """
-    n, shape = len(links), (len(links), len(pose), 8)
+    if np.shape(pose)[1:] != (SIZE,):
+        raise ValueError(f"pose has shape {np.shape(pose)}; give a row of {SIZE} components, POSE, a vehicle")
+    n, shape = len(links), (len(links), len(pose), SIZE)
     value, derivative = rows_at(links, np.append(pose, np.zeros(2)), dt, sound_speed_mps, False, True)
     return value[:n], value[n:], derivative[:n, :-2].reshape(shape), derivative[n:, :-2].reshape(shape)
 

@@ -113,12 +113,14 @@ class Recording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """The true poses of one vehicle's origin: ``position_m`` (n, 3), ``yaw_rad`` (n,) unwrapped or None."""
+    """The true poses of one vehicle's origin: ``position_m`` (n, 3); angles (n,), yaw unwrapped; None where unknown."""
 
     vehicle: str
     time_s: Floats
     position_m: Floats
     yaw_rad: Floats | None
+    roll_rad: Floats | None = None
+    pitch_rad: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,7 +248,8 @@ class Fix:
     vehicle : str
     status : "ok" or why not; ``remedy`` says in one sentence what would help
     states : tuple of str
-        Names of the rows of ``covariance``, among x, y, z, yaw, clock, vx, vy, vz.
+        Names of the rows of ``covariance``, among x, y, z, yaw, clock, vx, vy, vz and, of a body that tilts, roll,
+        pitch and the rates of the three angles.
     position_m : float64 (3,) or None
         Of the vehicle's origin; None unless the status is "ok" or "inconsistent".
     velocity_mps : float64 (3,) or None
@@ -265,6 +268,8 @@ class Fix:
         The other solution where geometry leaves two.
     sound_speed_mps, sound_speed_sd_mps : float or None
         What the ranges say of the sound speed, with the epoch's own as the prior; None where that is taken as it is.
+    roll_rad, pitch_rad : float or None
+        Of a body that tilts (`attitude`); None where it is taken to stand upright.
     """
 
     time_s: float
@@ -286,6 +291,8 @@ class Fix:
     mirror_m: Floats | None = None
     sound_speed_mps: float | None = None
     sound_speed_sd_mps: float | None = None
+    roll_rad: float | None = None
+    pitch_rad: float | None = None
 
     def sd(self, state: str) -> float | None:
         """Return the standard deviation of a state by name, None where it is not estimated."""
@@ -299,9 +306,9 @@ class Fix:
 class Estimate:
     """The track of one vehicle at one instant: what its filter believes.
 
-    ``states`` names the rows of ``covariance`` (x, y, z, yaw, clock, vx, vy, vz as estimated); the pose is that of the
-    vehicle's origin. ``source``: "fix" or "fused" where a measurement entered, "predicted" where none did,
-    "smoothed" where what came later did too.
+    ``states`` names the rows of ``covariance`` (x, y, z, yaw, clock, vx, vy, vz, roll, pitch as estimated); the pose is
+    that of the vehicle's origin, roll and pitch None where it is taken to stand upright. ``source``: "fix" or "fused"
+    where a measurement entered, "predicted" where none did, "smoothed" where what came later did too.
     """
 
     time_s: float
@@ -313,6 +320,8 @@ class Estimate:
     clock_offset_m: float | None
     covariance: Floats
     source: Source
+    roll_rad: float | None = None
+    pitch_rad: float | None = None
 
     def sd(self, state: str) -> float | None:
         """Return the standard deviation of a state by name, None where it is not estimated."""

@@ -126,11 +126,16 @@ class Signal(_Section):
 
 
 class Vehicle(_Section):
-    """`[[vehicle]]`: its origin moves on the level `z_m` where that is known."""
+    """`[[vehicle]]`: its origin moves on the level `z_m` where that is known.
+
+    `tilt_sd_rad` is how far it tilts, one sigma of roll and of pitch; 0: it always stands upright. Where it is not
+    stated, `geometry.tilting` says what holds.
+    """
 
     id: Id
     z_m: Number | None = None
     max_speed_mps: Positive | None = None
+    tilt_sd_rad: NotNegative | None = None
 
 
 class MSequenceCode(_Section):

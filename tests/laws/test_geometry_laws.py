@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sonofix.geometry import Links, model
 from sonofix.records import Floats
@@ -29,7 +30,8 @@ def worlds(draw: st.DrawFn, sounding: bool = True) -> tuple[Links, Floats, Float
     points = draw(draws(-8, 8, 2, n, 3))
     for side, vehicle in zip(points, (emitter_vehicle, receiver_vehicle), strict=True):
         side[vehicle >= 0] *= 0.1  # lever arms up to 0.8 m
-    poses = np.column_stack([draw(draws(-8, 8, 2, 3)), draw(draws(-7, 7, 2)), draw(draws(-3, 3, 2, 4))])
+    motion = [draw(draws(-8, 8, 2, 3)), draw(draws(-7, 7, 2)), draw(draws(-3, 3, 2, 4)), draw(draws(-1.5, 1.5, 2, 4))]
+    poses = np.column_stack(motion)
     return (
         Links(emitter_vehicle, points[0], receiver_vehicle, points[1], np.zeros(n)),
         poses,
@@ -77,8 +79,8 @@ def test_rate_derivatives_of_moving_emitters_hold_to_the_order_of_v_over_c(
     links, poses, dt = world
     range_m, _, _, by_rate = model(links, poses, dt, SPEED)
     # left out is how the moment of sending and the lag answer: (v/c) times speeds over ranges, speeds up to 8 m/s with
-    # an arm of 1.4 m that turns, ranges from 0.5 m, and an acceleration of the arm up to 13 m/s²
-    order = 8.0 / SPEED * (1 + 8.0 / 0.5) * np.maximum(1.0, 1.4)
+    # an arm of 1.4 m that turns and tilts, ranges from 0.5 m, and an acceleration of the arm up to 40 m/s²
+    order = 12.0 / SPEED * (1 + 12.0 / 0.5) * np.maximum(1.0, 1.4)
     gap = np.abs(by_rate - differences(*world)[1])[away(range_m)]
     assert gap.max(initial=0.0) < 3 * order
 
@@ -115,5 +117,35 @@ def test_only_time_from_the_reference_instant_matters(world: tuple[Links, Floats
     later = poses.copy()
     later[:, :3] += later_s * poses[:, 4:7]
     later[:, 3] += later_s * poses[:, 7]
+    later[:, 8:10] += later_s * poses[:, 10:]
     before, after = model(links, poses, dt, SPEED), model(links, later, dt - later_s, SPEED)
     np.testing.assert_allclose(after[0], before[0], atol=1e-9)
+
+
+@given(worlds(), draws(-3, 3, 3))
+def test_turning_arms_and_body_the_other_way_moves_no_range(
+    world: tuple[Links, Floats, Floats], angles: Floats
+) -> None:
+    # R arm = (R Q⁻¹)(Q arm): a body whose axes are drawn on it otherwise is the same body
+    links, poses, dt = world
+    still = poses.copy()
+    still[:, [7, 10, 11]] = 0.0
+    turn = Rotation.from_euler("ZYX", angles)
+    other = still.copy()
+    for pose in other:
+        pose[[3, 9, 8]] = (Rotation.from_euler("ZYX", pose[[3, 9, 8]]) * turn.inv()).as_euler("ZYX")
+
+    def drawn(vehicle: Floats, point: Floats) -> Floats:
+        return np.where((vehicle < 0)[:, None], point, turn.apply(point))
+
+    elsewhere = Links(
+        links.emitter_vehicle,
+        drawn(links.emitter_vehicle, links.emitter_point),
+        links.receiver_vehicle,
+        drawn(links.receiver_vehicle, links.receiver_point),
+        links.emitter_sd_m,
+    )
+    before, after = model(links, still, dt, SPEED), model(elsewhere, other, dt, SPEED)
+    apart = away(before[0])
+    np.testing.assert_allclose(after[0][apart], before[0][apart], atol=1e-9)
+    np.testing.assert_allclose(after[1][apart], before[1][apart], atol=1e-8)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sonofix.geometry import Links, model
+from sonofix.geometry import ALONE, CLOCK, Links, model
 from sonofix.locate.start import FLAT, ROUNDING
 from sonofix.records import Floats
 
@@ -15,7 +15,7 @@ SPEED = 343.0
 
 @dataclass(frozen=True)
 class Problem:
-    """Rows of one vehicle, index 0 of `links`; `index` says which of a state (10,) are unknown."""
+    """Rows of one vehicle, index 0 of `links`; `index` says which of a state (ALONE,) are unknown."""
 
     links: Links
     measured: Floats
@@ -26,7 +26,7 @@ class Problem:
 
     @property
     def clock(self) -> bool:
-        return 8 in self.index
+        return CLOCK in self.index
 
     @property
     def rows(self) -> tuple:
@@ -45,13 +45,13 @@ class Problem:
 
 def misfit(problem: Problem, state: Floats) -> tuple[Floats, Floats]:
     """Whitened misfit and Jacobian."""
-    range_m, rate, by_range, by_rate = model(problem.links, state[None, :8], problem.dt, SPEED)
+    range_m, rate, by_range, by_rate = model(problem.links, state[None, :CLOCK], problem.dt, SPEED)
     n = len(problem.dt)
-    value, derivative = np.concatenate([range_m, rate]), np.zeros((2 * n, 10))
-    derivative[:, :8] = np.concatenate([by_range[:, 0], by_rate[:, 0]])
+    value, derivative = np.concatenate([range_m, rate]), np.zeros((2 * n, ALONE))
+    derivative[:, :CLOCK] = np.concatenate([by_range[:, 0], by_rate[:, 0]])
     if problem.clock:
-        value += np.repeat(state[8:], n)
-        derivative[:n, 8] = derivative[n:, 9] = 1.0
+        value += np.repeat(state[CLOCK:], n)
+        derivative[:n, CLOCK] = derivative[n:, CLOCK + 1] = 1.0
     m, whiten = len(problem.measured), problem.whiten
     return whiten @ (problem.measured - value[:m]), whiten @ derivative[:m][:, problem.index]
 
@@ -142,7 +142,7 @@ def search(problem: Problem) -> list[tuple[Floats, float]]:
         whiten = problem.whiten[:n, :n]
         misfits = []
         for yaw in round_:
-            pose = np.array([*begin[:3], yaw, 0, 0, 0, 0])
+            pose = np.array([*begin[:3], yaw, *np.zeros(8)])
             miss = problem.measured[:n] - model(links, pose[None], problem.dt, SPEED)[0] - begin[3] * problem.clock
             misfits.append(float(np.sum((whiten @ miss) ** 2)))
         best = int(np.argmin(misfits))
@@ -151,7 +151,7 @@ def search(problem: Problem) -> list[tuple[Floats, float]]:
 
     def descend(begin: Floats) -> None:
         for yaw in yaws(begin) if turns else [0.0]:
-            state, chi2, rests = solve(problem, np.array([*begin[:3], yaw, 0, 0, 0, 0, begin[3], 0]))
+            state, chi2, rests = solve(problem, np.array([*begin[:3], yaw, *np.zeros(8), begin[3], 0]))
             if rests:
                 found.append((state, chi2))
 
@@ -163,7 +163,7 @@ def search(problem: Problem) -> list[tuple[Floats, float]]:
         normal = np.linalg.svd(flat - flat.mean(axis=0))[2][-1]
         image = best[:3].copy()
         image[:dims] -= 2 * ((best[:dims] - flat.mean(axis=0)) @ normal) * normal
-        descend(np.append(image, best[8]))
+        descend(np.append(image, best[CLOCK]))
     out: list[tuple[Floats, float]] = []
     for state, chi2 in sorted(found, key=lambda f: f[1]):
         turn = [abs(np.angle(np.exp(1j * (state[3] - other[3])))) for other, _ in out]

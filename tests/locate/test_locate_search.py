@@ -7,7 +7,7 @@ import pytest
 
 from locate import plain
 from locate.made_epochs import BOUNDS, HALL, SPEED, Drive, make_epoch, make_site, shifted
-from sonofix.geometry import expected, link
+from sonofix.geometry import ALONE, CLOCK, expected, link
 from sonofix.locate.noise import fill_noise
 from sonofix.locate.rows import gather, look
 from sonofix.locate.search import MOST, search, without
@@ -42,7 +42,7 @@ def problem_of(case: str, rng: np.random.Generator) -> plain.Problem:
     times = rng.uniform(0.0, 0.05, len(walls) * len(arms))
     epoch = make_epoch(site, drive, times, rate_sd_mps=rate_sd, clock_m=clock_m, rng=rng)
     places = [0, 1] + [2] * (level_m is None) + [3] * (len(arms) > 1)
-    index = np.array(places + [4 + p for p in places if rate_sd] + [8] * (clock_m is not None))
+    index = np.array(places + [4 + p for p in places if rate_sd] + [CLOCK] * (clock_m is not None))
     measured, n = epoch.range_m, len(epoch)
     covariance = epoch.covariance_m2 + 1e-5
     if rate_sd:
@@ -57,7 +57,7 @@ def problem_of(case: str, rng: np.random.Generator) -> plain.Problem:
 
 def searched(problem: plain.Problem) -> list[tuple[Floats, float, Floats]]:
     m, k = len(problem.measured), len(problem.index)
-    states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, m, k))
+    states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, m, k))
     level = (problem.level_m is not None, float(problem.level_m or 0.0))
     at = (problem.rows, SPEED, problem.clock, problem.covariance, problem.index, *level)
     count = search(*at, states, chi2s, jacobians)
@@ -86,7 +86,7 @@ def test_search_finds_what_its_plain_twin_finds(case: str, rng: np.random.Genera
 def test_a_covariance_that_is_not_positive_is_told(rng: np.random.Generator) -> None:
     problem = problem_of("space", rng)
     problem.covariance[0, 0] = -1.0
-    states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, len(problem.measured), 3))
+    states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, len(problem.measured), 3))
     at = (problem.rows, SPEED, False, problem.covariance, problem.index, False, 0.0)
     assert search(*at, states, chi2s, jacobians) == -1
 
@@ -99,7 +99,7 @@ def test_trials_without_rows_match_their_plain_twin(case: str, left_out: int, rn
     state = plain.search(problem)[0][0]
     n = len(problem.dt)
     choices = np.array([np.delete(np.arange(n), rng.choice(n, left_out, replace=False)) for _ in range(6)])
-    states, chi2s = np.empty((6, 10)), np.empty(6)
+    states, chi2s = np.empty((6, ALONE)), np.empty(6)
     at = (problem.rows, SPEED, problem.clock, problem.covariance, problem.index)
     without(*at, choices, state, states, chi2s)
     for i, keep in enumerate(choices):
@@ -177,7 +177,7 @@ def test_dilution_and_residuals_match_their_plain_twin(case: str, rng: np.random
     ranges = plain.Problem(problem.links, problem.measured[:n], problem.dt, np.eye(n), problem.index, problem.level_m)
     miss, jacobian = plain.misfit(ranges, state)
     np.testing.assert_allclose(residual, miss, atol=1e-12)
-    places = [i for i, j in enumerate(problem.index) if j < 4 or j == 8]
+    places = [i for i, j in enumerate(problem.index) if j < 4 or j == CLOCK]
     covariance = np.linalg.inv(jacobian[keep][:, places].T @ jacobian[keep][:, places])
     assert hdop == pytest.approx(np.sqrt(covariance[0, 0] + covariance[1, 1]), rel=1e-9)
     assert vdop == pytest.approx(np.sqrt(covariance[2, 2]) if problem.level_m is None else 0.0, rel=1e-9)

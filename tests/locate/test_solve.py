@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from locate import plain
 from locate.made_epochs import HALL, SPEED, Drive, make_epoch, make_site
-from sonofix.geometry import link
+from sonofix.geometry import ALONE, CLOCK, link
 from sonofix.locate.dense import whitener
 from sonofix.locate.solve import SAME, descend
 from sonofix.records import Floats, RangeEpoch
@@ -26,7 +26,7 @@ def problem_of(site: Site, epoch: RangeEpoch, index: Floats) -> plain.Problem:
     if epoch.range_rate_mps is not None:
         variance = np.concatenate([variance, epoch.range_rate_sd_mps**2])
         measured = np.concatenate([measured, epoch.range_rate_mps])
-    index = np.append(index, 8) if epoch.clock == "common" else index
+    index = np.append(index, CLOCK) if epoch.clock == "common" else index
     links = link(site, epoch.emitter, epoch.receiver)
     return plain.Problem(links, measured, epoch.time_s, np.diag(variance), index)
 
@@ -39,7 +39,7 @@ def solve(
     whiten, plain_miss, miss, jacobian = np.empty((m, m)), np.empty(m), np.empty(m), np.empty((m, k))
     assert whitener(problem.covariance, whiten)
     state = np.array(begin, float)
-    known = np.empty((0, 10)) if known is None else known
+    known = np.empty((0, ALONE)) if known is None else known
     at = (problem.rows, SPEED, problem.clock, whiten, problem.index, known, iterations)
     chi2, rests = descend(*at, state, plain_miss, miss, jacobian)
     assert chi2 == pytest.approx(miss @ miss, rel=1e-12)
@@ -47,7 +47,7 @@ def solve(
 
 
 def start(*place: float, clock_m: float = 0.0) -> Floats:
-    return np.array([*place, 0.0, 0.0, 0.0, 0.0, 0.0, clock_m, 0.0])
+    return np.array([*place, *np.zeros(9), clock_m, 0.0])
 
 
 @pytest.mark.parametrize("rate_sd_mps", [None, 0.05])
@@ -84,7 +84,7 @@ def test_jacobian_is_the_derivative_of_what_is_expected() -> None:
     problem = problem_of(site, make_epoch(site, DRIVE, 0.01, rate_sd_mps=0.05, clock_m=3.0), MOVING)
     found, _, _, _, jacobian = solve(problem, start(4.0, 3.0, 1.0))
     for i, j in enumerate(problem.index):
-        step = np.zeros(10)
+        step = np.zeros(ALONE)
         step[j] = 1e-5
         slope = (plain.misfit(problem, found + step)[0] - plain.misfit(problem, found - step)[0]) / 2e-5
         np.testing.assert_allclose(jacobian[:, i], -slope, atol=1e-5)
@@ -93,7 +93,7 @@ def test_jacobian_is_the_derivative_of_what_is_expected() -> None:
 
 def test_components_that_are_not_asked_for_stay_as_they_were_given() -> None:
     site = make_site(HALL, level_m=1.0)
-    begin = np.array([5.0, 4.0, 1.0, 0.3, 0.2, -0.1, 0.05, 0.6, 0.0, 0.0])
+    begin = np.array([5.0, 4.0, 1.0, 0.3, 0.2, -0.1, 0.05, 0.6, *np.zeros(6)])
     found, *_ = solve(problem_of(site, make_epoch(site, DRIVE), np.array([0, 1])), begin)
     np.testing.assert_array_equal(found[2:], begin[2:])
     np.testing.assert_allclose(found[:2], DRIVE.position_m[:2], atol=1e-7)
@@ -120,7 +120,7 @@ def test_a_descent_to_a_place_already_known_ends_there() -> None:
     site = make_site(HALL)
     problem = problem_of(site, make_epoch(site, DRIVE), POSITION)
     home, *_ = solve(problem, start(4.0, 3.0, 1.0))
-    elsewhere = home + np.array([1.0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+    elsewhere = home + np.eye(ALONE)[0]
     found, _, rests, *_ = solve(problem, start(60.0, -40.0, 20.0), known=np.array([elsewhere, home]))
     assert not rests
     assert np.linalg.norm(found[:3] - home[:3]) < SAME

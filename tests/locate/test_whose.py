@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonofix.geometry import link, model
+from sonofix.geometry import SIZE, link, model
 from sonofix.locate.fix import fix
 from sonofix.locate.whose import tell_whose
 from sonofix.records import RangeEpoch
@@ -36,7 +36,7 @@ def site(right: list[tuple[float, float, float]] = RIGHT, near: list[tuple[float
 
 def heard(place: tuple[float, float, float], zone: str, wrap_m: float = 0.0) -> RangeEpoch:
     """Ranges to the four beacons of a zone, each named after the first of its code, modulo ``wrap_m``."""
-    pose = np.zeros((1, 8))
+    pose = np.zeros((1, SIZE))
     pose[0, :3], pose[0, 4:6] = place, (0.5, -0.2)
     links = link(site(), tuple(f"{zone}{k}" for k in range(4)), ("M",) * 4)
     range_m, rate, *_ = model(links, pose, np.zeros(4), SPEED)

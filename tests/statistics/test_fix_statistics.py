@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from locate.made_epochs import BOUNDS, HALL, SPEED, Drive, ends, heard_range_m, make_epoch, make_site
+from locate.made_epochs import BOUNDS, HALL, SPEED, ends, heard_range_m, make_epoch, make_site
+from locate.made_tilts import CORNERS, Flight
+from sonofix.geometry import SIZE
 from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Floats, RangeEpoch
@@ -22,11 +24,11 @@ OUTSIDE = 1e-6
 PLACE = (3.0, 5.5, 1.1)
 CEILING = ((0.0, 0.0, 3.2), (10.0, 0.0, 3.2), (10.0, 8.0, 3.2), (0.0, 8.0, 3.2), (4.0, 3.0, 3.2))
 TWO_ARMS = ((0.35, 0.1, 0.5), (-0.3, -0.2, 0.5))
-COMPONENTS = {"x": 0, "y": 1, "z": 2, "yaw": 3, "vx": 4, "vy": 5, "vz": 6}
+COMPONENTS = {"x": 0, "y": 1, "z": 2, "yaw": 3, "vx": 4, "vy": 5, "vz": 6, "roll": 8, "pitch": 9}
 
 
-STANDING = Drive(PLACE)
-DRIVING = Drive(PLACE, (0.8, -0.6, 0.0), yaw_rad=0.5)
+STANDING = Flight(PLACE)
+DRIVING = Flight(PLACE, (0.8, -0.6, 0.0), yaw_rad=0.5)
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Case:
     states: tuple[str, ...]
     rate_sd_mps: float | None = None
     clock_m: float | None = None
-    drive: Drive = STANDING
+    drive: Flight = STANDING
     sd_m: float = 0.01
 
 
@@ -56,6 +58,19 @@ CASES = {
         clock_m=30.0,
         drive=DRIVING,
     ),
+    "three microphones on a body that tilts": Case(
+        make_site(HALL, arms_m=CORNERS),
+        ("x", "y", "z", "yaw", "roll", "pitch"),
+        sd_m=0.002,
+        drive=Flight(PLACE, yaw_rad=0.5, roll_rad=0.3, pitch_rad=-0.2),
+    ),
+    "the same, rocking, rates": Case(
+        make_site(HALL, arms_m=CORNERS),
+        ("x", "y", "z", "yaw", "roll", "pitch", "vx", "vy", "vz"),
+        sd_m=0.002,
+        rate_sd_mps=0.01,
+        drive=Flight(PLACE, (0.8, -0.6, 0.3), 0.5, 0.4, 0.3, -0.2, 0.9, -0.7),
+    ),
     "two microphones": Case(make_site(HALL, arms_m=TWO_ARMS, level_m=1.1), ("x", "y", "yaw"), drive=DRIVING),
 }
 
@@ -64,13 +79,14 @@ def bound(case: Case) -> Floats:
     """Cramér–Rao: inverse Fisher information by differences of the exact model, with nuisances (clock, yaw rate)."""
     site, drive = case.site, case.drive
     pairs = [(b.id, m.id) for b in site.beacons for m in site.microphones]
-    truth = np.array([*drive.position_m, drive.yaw_rad, *drive.velocity_mps, drive.yaw_rate_radps])
+    tilt = (drive.roll_rad, drive.pitch_rad, drive.roll_rate_radps, drive.pitch_rate_radps)
+    truth = np.array([*drive.position_m, drive.yaw_rad, *drive.velocity_mps, drive.yaw_rate_radps, *tilt])
     free = [COMPONENTS[s] for s in case.states]
     if case.rate_sd_mps is not None and "yaw" in case.states:
-        free.append(7)
+        free += [7] + [10, 11] * ("roll" in case.states)
 
     def shown(pose: Floats) -> Floats:
-        moved = Drive(pose[:3], pose[4:7], pose[3], pose[7])
+        moved = Flight(pose[:3], pose[4:7], pose[3], pose[7], *pose[8:])
         rows = [ends(site, moved, *pair) for pair in pairs]
         ranges = np.array([heard_range_m(*row, 0.0) for row in rows]) / case.sd_m
         if case.rate_sd_mps is None:
@@ -80,7 +96,7 @@ def bound(case: Case) -> Floats:
 
     columns = []
     for i in free:
-        step = np.zeros(8)
+        step = np.zeros(SIZE)
         step[i] = 1e-4
         columns.append((shown(truth + step) - shown(truth - step)) / 2e-4)
     if case.clock_m is not None:
@@ -110,15 +126,17 @@ class Outcome:
 
 def measure(case: Case, trials: int, rng: np.random.Generator) -> Outcome:
     error, squared, horizontal, doubted = [], [], [], 0
-    truth = np.array([*case.drive.position_m, case.drive.yaw_rad, *case.drive.velocity_mps])
+    pose = [*case.drive.position_m, case.drive.yaw_rad, *case.drive.velocity_mps]
+    truth = np.array([*pose, 0.0, case.drive.roll_rad, case.drive.pitch_rad])
     index = [COMPONENTS[s] for s in case.states]
-    exact = make_epoch(case.site, case.drive, rate_sd_mps=case.rate_sd_mps, clock_m=case.clock_m)
+    exact = make_epoch(case.site, case.drive, sd_m=case.sd_m, rate_sd_mps=case.rate_sd_mps, clock_m=case.clock_m)
     for _ in range(trials):
         found = fix(noisy(exact, case, rng), case.site, "v")
         assert found.status == "ok", found.remedy
         doubted += not found.used.all()
         velocity = found.velocity_mps if found.velocity_mps is not None else np.zeros(3)
-        whole = np.array([*found.position_m, found.yaw_rad or 0.0, *velocity])
+        attitude = (found.yaw_rad or 0.0, found.roll_rad or 0.0, found.pitch_rad or 0.0)
+        whole = np.array([*found.position_m, attitude[0], *velocity, 0.0, *attitude[1:]])
         miss = (whole - truth)[index]
         if "yaw" in case.states:
             miss[case.states.index("yaw")] = np.angle(np.exp(1j * miss[case.states.index("yaw")]))

@@ -57,7 +57,9 @@ def test_rows_agree_with_the_model_of_the_street(laid_out) -> None:
     epoch = mixed_epoch()
     plain = Guess(guess.states, guess.place_m, np.zeros(0), 0.0, np.zeros(3))
     shown = show(drive, plain, np.full(len(drive), -1))
-    pose = np.array([[*guess.states[0, :3], guess.states[0, 9], *guess.states[0, 3:6], guess.states[0, 10]]])
+    pose = np.array(
+        [[*guess.states[0, :3], guess.states[0, 9], *guess.states[0, 3:6], guess.states[0, 10], 0, 0, 0, 0]]
+    )
     names = list(zip(epoch.emitter, epoch.receiver, strict=True))
     order = [names.index(pair) for pair in zip(drive.emitter, drive.receiver, strict=True)]
     dt = epoch.time_s - drive.state_time_s[0]

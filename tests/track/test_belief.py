@@ -9,12 +9,13 @@ import pytest
 from scipy.linalg import expm
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site
-from sonofix.geometry import POSE
+from sonofix.geometry import SIZE
 from sonofix.locate.fix import fix
 from sonofix.records import Floats
 from sonofix.track.belief import Belief, Motion, age, blank, estimate, place, predict, start_at
 
-MOTION = Motion(acceleration_psd=0.7, climb_psd=0.03, turn_psd=0.2, clock_psd=3e-6)
+PACE, TILT_SD_RAD = 1.7, 0.25
+MOTION = Motion(acceleration_psd=0.7, climb_psd=0.03, turn_psd=0.2, clock_psd=3e-6, tilt_pace_radps=PACE)
 PLACE = (3.0, 5.5, 1.1)
 NO_ARM = np.zeros(2)
 TWO_ARMS = ((0.35, 0.1, 0.5), (-0.3, -0.2, 0.5))
@@ -22,19 +23,28 @@ TWO_ARMS = ((0.35, 0.1, 0.5), (-0.3, -0.2, 0.5))
 
 def full_belief(rng: np.random.Generator, vehicles: int = 1) -> Belief:
     """Everything estimated, correlated at random."""
-    n = len(POSE) * vehicles + 2
+    n = SIZE * vehicles + 2
     half = rng.standard_normal((n, n))
-    return Belief(2.0, rng.standard_normal(n), half @ half.T, np.ones(n, bool), np.ones(vehicles, bool))
+    tilts = np.full(vehicles, TILT_SD_RAD)
+    placed = np.ones(vehicles, bool)
+    return Belief(2.0, rng.standard_normal(n), half @ half.T, np.ones(n, bool), placed, tilt_sd_rad=tilts)
 
 
 def dynamics(vehicles: int) -> tuple[Floats, Floats]:
     """F and Q of ẋ = F x + w by hand: places are driven by speeds, speeds by white noise."""
-    n = len(POSE) * vehicles + 2
+    n = SIZE * vehicles + 2
     drift, psd = np.zeros((n, n)), np.zeros(n)
     for v in range(vehicles):
         for i in range(4):
-            drift[8 * v + i, 8 * v + 4 + i] = 1.0
-        psd[8 * v + 4 : 8 * v + 8] = MOTION.acceleration_psd, MOTION.acceleration_psd, MOTION.climb_psd, MOTION.turn_psd
+            drift[SIZE * v + i, SIZE * v + 4 + i] = 1.0
+        psds = MOTION.acceleration_psd, MOTION.acceleration_psd, MOTION.climb_psd, MOTION.turn_psd
+        psd[SIZE * v + 4 : SIZE * v + 8] = psds
+        for i in (8, 9):
+            # a body that comes back upright: critically damped, of variance σ² for ever
+            drift[SIZE * v + i, SIZE * v + 2 + i] = 1.0
+            drift[SIZE * v + 2 + i, SIZE * v + i] = -(PACE**2)
+            drift[SIZE * v + 2 + i, SIZE * v + 2 + i] = -2 * PACE
+            psd[SIZE * v + 2 + i] = 4 * PACE**3 * TILT_SD_RAD**2
     drift[-2, -1], psd[-1] = 1.0, MOTION.clock_psd
     return drift, np.diag(psd)
 
@@ -88,10 +98,21 @@ def test_looking_back_also_costs_certainty(rng: np.random.Generator) -> None:
     belief = full_belief(rng)
     back = predict(belief, belief.time_s - 0.3, MOTION)
     there_and_back = predict(back, belief.time_s, MOTION)
-    np.testing.assert_allclose(there_and_back.mean, belief.mean, atol=1e-12)
-    gained = np.linalg.eigvalsh(there_and_back.covariance - belief.covariance)
+    # a body that tilts comes upright again both ways in time: of its tilt nothing is kept for ever
+    kept = np.r_[0:8, SIZE : SIZE + 2]
+    np.testing.assert_allclose(there_and_back.mean[kept], belief.mean[kept], atol=1e-12)
+    gained = np.linalg.eigvalsh((there_and_back.covariance - belief.covariance)[np.ix_(kept, kept)])
     assert gained.min() > -1e-12
     assert gained.max() > 0
+
+
+@pytest.mark.parametrize("dt_s", [60.0, -60.0])
+def test_a_tilt_that_nothing_tells_of_ends_as_it_began(dt_s: float, rng: np.random.Generator) -> None:
+    belief = full_belief(rng)
+    aged = predict(belief, belief.time_s + dt_s, MOTION)
+    np.testing.assert_allclose(aged.mean[8:SIZE], 0.0, atol=1e-12)
+    settled = np.diag([TILT_SD_RAD**2] * 2 + [(PACE * TILT_SD_RAD) ** 2] * 2)
+    np.testing.assert_allclose(aged.covariance[8:SIZE, 8:SIZE], settled, atol=1e-12)
 
 
 def test_a_known_level_never_becomes_uncertain() -> None:
@@ -139,8 +160,8 @@ def test_placing_forgets_what_was_believed_of_that_vehicle_alone(rng: np.random.
     found = fix(make_epoch(site, Drive(PLACE)), site, "v")
     belief = full_belief(rng, 2)
     placed = place(belief, 0, found, NO_ARM)
-    np.testing.assert_array_equal(placed.mean[8:], belief.mean[8:])
-    np.testing.assert_array_equal(placed.covariance[8:, 8:], belief.covariance[8:, 8:])
+    np.testing.assert_array_equal(placed.mean[SIZE:], belief.mean[SIZE:])
+    np.testing.assert_array_equal(placed.covariance[SIZE:, SIZE:], belief.covariance[SIZE:, SIZE:])
     assert not placed.covariance[:8, 8:].any()
     assert np.linalg.eigvalsh(placed.covariance).min() > -1e-9
 
@@ -193,14 +214,15 @@ def test_ageing_matches_its_plain_twin(rng: np.random.Generator) -> None:
     # F P Fᵀ + Q with whole matrices, pair by pair of a place and its rate
     motion = Motion(0.5, 0.01, 0.3, 1e-6)
     for dt in (0.4, -0.2, 3.0):
-        n = 26
+        n = 3 * SIZE + 2
         half = rng.standard_normal((n, n))
         free = rng.random(n) < 0.7
+        free[[SIZE * v + k for v in range(3) for k in range(8, SIZE)]] = False
         placed = np.array([True, False, True])
         belief = Belief(1.0, rng.standard_normal(n), half @ half.T, free, placed)
         step, noise = np.eye(n), np.zeros((n, n))
-        pairs = [(8 * v + k, 8 * v + 4 + k, psd) for v in (0, 2) for k, psd in enumerate((0.5, 0.5, 0.01, 0.3))]
-        for at, rate, psd in [*pairs, (24, 25, 1e-6)]:
+        pairs = [(SIZE * v + k, SIZE * v + 4 + k, psd) for v in (0, 2) for k, psd in enumerate((0.5, 0.5, 0.01, 0.3))]
+        for at, rate, psd in [*pairs, (n - 2, n - 1, 1e-6)]:
             if not free[rate]:
                 continue
             step[at, rate] = dt

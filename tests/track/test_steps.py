@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from sonofix.files import read_recording, read_truth
 from sonofix.flow import Street, run
+from sonofix.geometry import SIZE
 from sonofix.records import Estimate, Floats, Table
 from sonofix.track import steps
 from sonofix.track.belief import Belief, Motion, blank, estimate, predict
@@ -19,7 +20,7 @@ from sonofix.track.inputs import gather
 from track.made_walks import LEVEL_M, PERIOD_S, SITE, Walk, epoch_of, steps_of
 
 OUTSIDE = 1e-6
-SLOT, AT = 8, np.array([0, 1])
+SLOT, AT = SIZE, np.array([0, 1])
 
 
 def told(*rows: tuple[float, float, float]) -> dict[str, Table]:
@@ -34,7 +35,7 @@ def errors(got: Estimate, walk: Walk) -> tuple[float, float]:
 
 
 def random_belief(rng: np.random.Generator) -> tuple[Floats, Floats]:
-    n = 8 + 4 + 2
+    n = SIZE + 4 + 2
     half = 0.1 * rng.standard_normal((n, n))
     return 0.1 * rng.standard_normal(n), half @ half.T
 
@@ -208,8 +209,8 @@ def test_estimates_at_a_rate_follow_each_step(rng: np.random.Generator) -> None:
 
 def test_no_table_no_states() -> None:
     assert gather(SITE, {}) is None
-    assert len(blank(SITE).mean) == 10
-    assert len(blank(SITE, gather(SITE, told((0.5, 0.6, 0.0)))).mean) == 14
+    assert len(blank(SITE).mean) == SIZE + 2
+    assert len(blank(SITE, gather(SITE, told((0.5, 0.6, 0.0)))).mean) == SIZE + 6
 
 
 def test_the_walk_among_the_captures(captures: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of, shifted
-from sonofix.geometry import Links, link
+from sonofix.geometry import SIZE, Links, link
 from sonofix.records import Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, blank, predict
@@ -23,7 +23,7 @@ FAR = np.vstack([np.eye(3), -np.eye(3), [[0.6, 0.8, 0.0]]]) * FAR_M
 
 def believed(site: Site, mean: Floats, covariance: Floats, time_s: float = 0.0, clock: bool = False) -> Belief:
     """A belief over x, y, z, vx, vy, vz (and the clock) of the site's only vehicle."""
-    index = np.append(FREE, [8, 9]) if clock else FREE
+    index = np.append(FREE, [SIZE, SIZE + 1]) if clock else FREE
     empty = blank(site)
     whole, full, free = empty.mean.copy(), empty.covariance.copy(), empty.free.copy()
     whole[index], full[np.ix_(index, index)], free[index] = mean, covariance, True
@@ -88,7 +88,7 @@ def test_rates_and_an_unknown_clock_in_the_textbook_filter(rng: np.random.Genera
     r = np.diag(np.repeat([0.05**2, 0.04**2], 7))
     gain = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + r)
     miss = np.concatenate([epoch.range_m - FAR_M, epoch.range_rate_mps]) - h @ mean
-    index = np.append(FREE, [8, 9])
+    index = np.append(FREE, [SIZE, SIZE + 1])
     np.testing.assert_allclose(got.mean[index], mean + gain @ miss, atol=2e-7)
     np.testing.assert_allclose(got.covariance[np.ix_(index, index)], (np.eye(8) - gain @ h) @ covariance, atol=1e-8)
 

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of
 from sonofix.files import read_recording, read_truth
 from sonofix.flow import Street, run
+from sonofix.geometry import SIZE
 from sonofix.records import Floats, Table
 from sonofix.track import wheels
 from sonofix.track.belief import Motion, estimate, predict
@@ -21,13 +22,13 @@ from sonofix.track.follow import Follower
 from sonofix.track.inputs import gather
 
 OUTSIDE = 1e-6
-SLOT = 8
+SLOT = SIZE
 SITE = make_site(HALL, level_m=1.1)
 ARM = np.array([0.3, -0.2])
 
 
 def test_an_arc_is_the_textbook_update_by_numerical_derivatives(rng: np.random.Generator) -> None:
-    n = 8 + 5 + 2
+    n = SIZE + 5 + 2
     for _ in range(10):
         half = 0.02 * rng.standard_normal((n, n))
         mean, covariance = 0.05 * rng.standard_normal(n), half @ half.T

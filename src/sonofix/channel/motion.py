@@ -25,11 +25,15 @@ class Poses:
         East-north-up.
     yaw_rad : float64 (n,)
         Counter-clockwise from east, unwrapped.
+    roll_rad, pitch_rad : float64 (n,) or None
+        As `attitude` has them, unwrapped; None: upright.
     """
 
     position_m: Floats
     velocity_mps: Floats
     yaw_rad: Floats
+    roll_rad: Floats | None = None
+    pitch_rad: Floats | None = None
 
 
 class Motion(Protocol):
@@ -136,6 +140,8 @@ class Sampled:
     position_m : float64 (n, 3)
     yaw_rad : float64 (n,) or None
         None: along the direction of travel at each row; where the vehicle stands, as before.
+    roll_rad, pitch_rad : float64 (n,) or None
+        None: upright.
     interpolation : "cubic" or "linear"
         "cubic" is a Hermite curve with three-point slopes: C1, and third-order in the rows' spacing. "linear" has
         velocities that jump at every row.
@@ -145,8 +151,10 @@ class Sampled:
     position_m: Floats
     yaw_rad: Floats | None = None
     interpolation: Literal["cubic", "linear"] = "cubic"
-    _values: Floats = field(init=False, repr=False)  # (n, 4): position and unwrapped yaw at the rows
-    _slopes: Floats = field(init=False, repr=False)  # (n, 4): their three-point derivatives
+    roll_rad: Floats | None = None
+    pitch_rad: Floats | None = None
+    _values: Floats = field(init=False, repr=False)  # (n, 6): position and unwrapped yaw, roll, pitch at the rows
+    _slopes: Floats = field(init=False, repr=False)  # (n, 6): their three-point derivatives
 
     def __post_init__(self) -> None:
         """Check shapes, finiteness and order; lay the curve.
@@ -161,12 +169,16 @@ class Sampled:
             raise ValueError(f"time_s has {n} rows; a sampled motion needs at least 2 (else use Still)")
         if np.shape(self.position_m) != (n, 3):
             raise ValueError(f"position_m has shape {np.shape(self.position_m)}; ({n}, 3) would fit time_s")
-        if self.yaw_rad is not None and np.shape(self.yaw_rad) != (n,):
-            raise ValueError(f"yaw_rad has shape {np.shape(self.yaw_rad)}; ({n},) would fit time_s")
+        for name in ("yaw_rad", "roll_rad", "pitch_rad"):
+            angle = getattr(self, name)
+            if angle is not None and np.shape(angle) != (n,):
+                raise ValueError(f"{name} has shape {np.shape(angle)}; ({n},) would fit time_s")
         if not (np.isfinite(self.time_s).all() and np.isfinite(self.position_m).all()):
             raise ValueError("time_s and position_m must be finite in every row")
-        if self.yaw_rad is not None and not np.isfinite(self.yaw_rad).all():
-            raise ValueError("yaw_rad must be finite in every row, or None")
+        for name in ("yaw_rad", "roll_rad", "pitch_rad"):
+            angle = getattr(self, name)
+            if angle is not None and not np.isfinite(angle).all():
+                raise ValueError(f"{name} must be finite in every row, or None")
         backwards = np.flatnonzero(np.diff(self.time_s) <= 0)
         if backwards.size:
             row = int(backwards[0])
@@ -177,9 +189,12 @@ class Sampled:
 
         rows, order = np.asarray(self.time_s, float), 2 if n > 2 else 1
         slope = np.gradient(np.asarray(self.position_m, float), rows, axis=0, edge_order=order)
-        yaw = _travel_yaw(slope) if self.yaw_rad is None else np.unwrap(np.asarray(self.yaw_rad, float))
-        object.__setattr__(self, "_values", np.column_stack([self.position_m, yaw]))
-        object.__setattr__(self, "_slopes", np.column_stack([slope, np.gradient(yaw, rows, edge_order=order)]))
+        angles = [_travel_yaw(slope) if self.yaw_rad is None else np.unwrap(np.asarray(self.yaw_rad, float))]
+        for tilt in (self.roll_rad, self.pitch_rad):
+            angles.append(np.zeros(n) if tilt is None else np.unwrap(np.asarray(tilt, float)))
+        bends = [np.gradient(angle, rows, edge_order=order) for angle in angles]
+        object.__setattr__(self, "_values", np.column_stack([self.position_m, *angles]))
+        object.__setattr__(self, "_slopes", np.column_stack([slope, *bends]))
 
     def at(self, time_s: Floats) -> Poses:
         """Return the poses at ``time_s`` (n,)."""
@@ -199,7 +214,9 @@ class Sampled:
             )
             rate = (6 * x * (x - 1) * (a - b) + (1 - x) * (1 - 3 * x) * m0 + x * (3 * x - 2) * m1) / step
         rate = np.where(((wanted >= rows[0]) & (wanted <= rows[-1]))[:, None], rate, 0.0)
-        return Poses(value[:, :3], rate[:, :3], value[:, 3])
+        roll = None if self.roll_rad is None else value[:, 4]
+        pitch = None if self.pitch_rad is None else value[:, 5]
+        return Poses(value[:, :3], rate[:, :3], value[:, 3], roll, pitch)
 
 
 def _travel_yaw(slope: Floats) -> Floats:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sonofix.attitude import spin, turned
 from sonofix.channel.motion import Motion
 from sonofix.channel.propagate import KNOT_S, PoseTable
 from sonofix.records import Floats, Truth
@@ -21,13 +22,7 @@ def position_at(node: Beacon | Microphone, motions: Mapping[str, Motion], time_s
     if node.position_m is not None:
         return np.tile(np.asarray(node.position_m, float), (len(time_s), 1))
     poses = motions[str(node.vehicle)].at(time_s)
-    return poses.position_m + _turned(node.lever_arm_m, poses.yaw_rad)
-
-
-def _turned(lever_arm_m: tuple[float, float, float], yaw_rad: Floats) -> Floats:
-    forward, left, up = lever_arm_m
-    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
-    return np.stack([cos * forward - sin * left, sin * forward + cos * left, np.full(len(yaw_rad), up)], axis=1)
+    return poses.position_m + turned(node.lever_arm_m, poses.roll_rad, poses.pitch_rad, poses.yaw_rad)
 
 
 def pose_table(
@@ -48,10 +43,13 @@ def pose_table(
     poses = motions[str(node.vehicle)].at(time_s)
     position, velocity = poses.position_m, poses.velocity_mps
     if any(node.lever_arm_m):
-        arm = _turned(node.lever_arm_m, poses.yaw_rad)
-        spin = np.gradient(poses.yaw_rad, KNOT_S)[:, None]
+        arm = turned(node.lever_arm_m, poses.roll_rad, poses.pitch_rad, poses.yaw_rad)
+        roll, pitch, yaw = (
+            np.zeros(len(time_s)) if angle is None else np.gradient(angle, KNOT_S)
+            for angle in (poses.roll_rad, poses.pitch_rad, poses.yaw_rad)
+        )
         position = position + arm
-        velocity = velocity + spin * np.stack([-arm[:, 1], arm[:, 0], np.zeros(len(arm))], axis=1)
+        velocity = velocity + np.cross(spin(poses.pitch_rad, poses.yaw_rad, (roll, pitch, yaw)), arm)
     speed = float(np.linalg.norm(np.diff(position, axis=0), axis=1).max()) / KNOT_S
     if speed > sound_speed_mps / 3:
         raise ValueError(
@@ -73,7 +71,7 @@ def truth_of(vehicle: str, motion: Motion, duration_s: float) -> Truth:
     """Poses of a vehicle's origin 200 times a second, from 0 to before ``duration_s``."""
     time_s = np.arange(max(int(np.ceil(duration_s * TRUTH_HZ - 1e-9)), 1)) / TRUTH_HZ
     poses = motion.at(time_s)
-    return Truth(vehicle, time_s, poses.position_m, poses.yaw_rad)
+    return Truth(vehicle, time_s, poses.position_m, poses.yaw_rad, poses.roll_rad, poses.pitch_rad)
 
 
 def survey_times(duration_s: float) -> Floats:

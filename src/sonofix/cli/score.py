@@ -130,10 +130,16 @@ def read_track(out: Path, site: Site) -> dict[str, TrackColumns]:
     variance[:, range(3), range(3)] = sd**2
     for i, j in ((0, 1), (0, 2), (1, 2)):
         variance[:, i, j] = variance[:, j, i] = np.where(np.isnan(sd[:, i] + sd[:, j]), np.nan, 0.0)
+    tilt: tuple[Floats, ...] = ()
+    if "roll_rad" in sheet:
+        sds = [sheet.numbers(f"sd_{name}_rad") for name in ("roll", "pitch", "yaw")]
+        tilt = (sheet.numbers("roll_rad"), sheet.numbers("pitch_rad"), np.column_stack(sds))
     tracks = {}
     for vehicle in dict.fromkeys(names.tolist()):
         rows = names == vehicle
-        tracks[vehicle] = TrackColumns(time[rows], place[rows], velocity[rows], yaw[rows], variance[rows])
+        tracks[vehicle] = TrackColumns(
+            time[rows], place[rows], velocity[rows], yaw[rows], variance[rows], *(column[rows] for column in tilt)
+        )
     return tracks
 
 
@@ -168,6 +174,10 @@ class _Sheet:
         if problems:
             raise RecordingError(problems)
         return cls(path, {name: [row[k] for row in rows] for k, name in enumerate(header)}, len(rows))
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether there is such a column."""
+        return name in self._columns
 
     def text(self, name: str, default: str = "") -> list[str]:
         return self._columns.get(name, [default] * self._length)
@@ -206,6 +216,13 @@ def _range_rows(figures: RangeFigures) -> dict[str, tuple[str, str]]:
 def track_rows(track: Mapping[str, TrackFigures]) -> dict[str, list[str]]:
     """Return the rows of a table of track figures, a column a vehicle."""
     every = list(track.values())
+    tilt: dict[str, list[str]] = {}
+    if any(f.rmse_roll_rad is not None for f in every):
+        tilt = {
+            "roll error, rms": [figure_text(_times(f.rmse_roll_rad, _DEGREES), ".2f", "°") for f in every],
+            "pitch error, rms": [figure_text(_times(f.rmse_pitch_rad, _DEGREES), ".2f", "°") for f in every],
+            "NEES of roll, pitch, yaw (3 is right)": [figure_text(f.nees_attitude, ".2f") for f in every],
+        }
     return {
         "rows in the truth's time": [str(f.rows) for f in every],
         "position error, rms": [length_text(f.rmse_xy_m) for f in every],
@@ -213,12 +230,17 @@ def track_rows(track: Mapping[str, TrackFigures]) -> dict[str, list[str]]:
         "95 % within": [length_text(f.p95_xy_m) for f in every],
         "largest": [length_text(f.max_xy_m) for f in every],
         "height error, rms": [length_text(f.rmse_z_m or None) for f in every],
-        "heading error, rms": [figure_text(_times(f.rmse_yaw_rad, 57.29577951308232), ".2f", "°") for f in every],
+        "heading error, rms": [figure_text(_times(f.rmse_yaw_rad, _DEGREES), ".2f", "°") for f in every],
         "velocity error, rms": [figure_text(_times(f.velocity_rms_mps, 1e3), ".1f", "mm/s") for f in every],
         "inside 2 sd": [figure_text(_times(f.inside_2sd, 100), ".1f", "%") for f in every],
         "NEES of x, y (2 is right)": [figure_text(f.nees_xy, ".2f") for f in every],
         "longest gap": [figure_text(f.longest_gap_s, ".2f", "s") for f in every],
+        **tilt,
     }
+
+
+_DEGREES = 57.29577951308232
+"""In a radian."""
 
 
 def _times(value: float | None, factor: float) -> float | None:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 MOTION_HELP = """How the vehicle moves; lengths in m, speeds in m/s. still:x,y · line:x,y,vx,vy · circle:cx,cy,r,speed
 (speed < 0: clockwise) · waypoints:x1,y1;x2,y2;…@speed (corners are rounded; ends where it began: laps) ·
-csv:FILE (columns time_s, x_m, y_m and, if you like, z_m, yaw_rad; stands before its first row and after its last).
+csv:FILE (columns time_s, x_m, y_m and, if you like, z_m, yaw_rad, roll_rad, pitch_rad; stands before its first row and
+after its last).
 Repeat it for several vehicles."""
 
 
@@ -204,7 +205,7 @@ def _sampled(path: Path, z_m: float, site: Site, vehicle: str) -> Motion:
 
     layout = Layout(
         ("time_s", "x_m", "y_m"),
-        ("z_m", "yaw_rad"),
+        ("z_m", "yaw_rad", "roll_rad", "pitch_rad"),
         given=("time_s", "x_m", "y_m"),
         per_vehicle=True,
         key="vehicle",
@@ -214,10 +215,10 @@ def _sampled(path: Path, z_m: float, site: Site, vehicle: str) -> Motion:
     rows = np.array(table.names["vehicle"]) == vehicle
     columns = {name: values[rows] for name, values in table.columns.items()}
     height = columns.get("z_m", np.full(int(rows.sum()), z_m))
-    yaw = columns.get("yaw_rad")
+    yaw, roll, pitch = (columns.get(name) for name in ("yaw_rad", "roll_rad", "pitch_rad"))
     try:
         position = np.column_stack([columns["x_m"], columns["y_m"], height])
-        return Sampled(columns["time_s"], position, None if yaw is None else np.unwrap(yaw))
+        return Sampled(columns["time_s"], position, yaw, roll_rad=roll, pitch_rad=pitch)
     except ValueError as error:
         raise ValueError(f"{path.name}: vehicle {vehicle}: {error}") from None
 

@@ -109,10 +109,11 @@ def read_truth(folder: str | Path) -> dict[str, Truth]:
     truths = {}
     for vehicle in dict.fromkeys(table.names["vehicle"]):
         rows = vehicles == vehicle
-        yaw = columns["yaw_rad"][rows] if "yaw_rad" in columns else None
-        if yaw is not None:
-            yaw = np.unwrap(yaw) if np.all(np.isfinite(yaw)) else None
-        truths[vehicle] = Truth(vehicle, columns["time_s"][rows], position_m[rows], yaw)
+        angles: list[Floats | None] = []
+        for name in ("yaw_rad", "roll_rad", "pitch_rad"):
+            angle = columns[name][rows] if name in columns else None
+            angles.append(np.unwrap(angle) if angle is not None and np.all(np.isfinite(angle)) else None)
+        truths[vehicle] = Truth(vehicle, columns["time_s"][rows], position_m[rows], *angles)
     return truths
 
 

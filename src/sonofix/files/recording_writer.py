@@ -92,15 +92,21 @@ def write_truth(path: Path, truth: Mapping[str, Truth]) -> None:
     """Write `truth.csv`: all vehicles' poses in order of time; the column `vehicle` where there are several."""
     times = np.concatenate([t.time_s for t in truth.values()])
     order = np.argsort(times, kind="stable")
-    yaws = [np.full(len(t.time_s), np.nan) if t.yaw_rad is None else t.yaw_rad for t in truth.values()]
     position_m = np.concatenate([t.position_m for t in truth.values()])[order]
     columns: dict[str, Floats] = {"time_s": times[order]}
     columns |= {name: position_m[:, i] for i, name in enumerate(("x_m", "y_m", "z_m"))}
-    if any(t.yaw_rad is not None for t in truth.values()):
-        columns["yaw_rad"] = np.concatenate(yaws)[order]
+    for name in ("yaw_rad", "roll_rad", "pitch_rad"):
+        angles = [getattr(t, name) for t in truth.values()]
+        if any(angle is not None for angle in angles):
+            known = [
+                np.full(len(t.time_s), np.nan if a is None else a) for t, a in zip(truth.values(), angles, strict=True)
+            ]
+            columns[name] = np.concatenate(known)[order]
     vehicles = [vehicle for vehicle, t in truth.items() for _ in t.time_s]
     names = {"vehicle": tuple(vehicles[i] for i in order)} if len(truth) > 1 else {}
-    write_table(path, Table(columns, names), ("time_s", "vehicle", "x_m", "y_m", "z_m", "yaw_rad"))
+    write_table(
+        path, Table(columns, names), ("time_s", "vehicle", "x_m", "y_m", "z_m", "yaw_rad", "roll_rad", "pitch_rad")
+    )
 
 
 def write_table(path: Path, table: Table, order: Sequence[str]) -> None:

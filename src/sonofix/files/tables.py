@@ -80,7 +80,7 @@ LAYOUTS = {
     "start": Layout(("x_m", "y_m", "yaw_rad"), ("z_m",), given=("x_m", "y_m"), per_vehicle=True, order=None),
     "truth": Layout(
         ("time_s", "x_m", "y_m", "z_m"),
-        ("yaw_rad",),
+        ("yaw_rad", "roll_rad", "pitch_rad"),
         given=("time_s", "x_m", "y_m", "z_m"),
         per_vehicle=True,
         key="vehicle",

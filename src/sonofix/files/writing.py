@@ -15,6 +15,7 @@ from typing import Self, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.attitude import quaternion
 from sonofix.files.problem import Problem, RecordingError
 from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step
 from sonofix.site import Site
@@ -26,6 +27,9 @@ COLUMNS = {
     "track.csv": "time_s,vehicle,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,yaw_rad,sd_x_m,sd_y_m,sd_z_m,sd_yaw_rad,source",
     "events.csv": "time_s,vehicle,event,detail",
 }
+
+TILT_COLUMNS = "roll_rad,pitch_rad,sd_roll_rad,sd_pitch_rad"
+"""What fixes.csv and track.csv have behind these where a vehicle of the site tilts."""
 
 
 def write_run(out: str | Path, steps: Iterable[Step], site: Site) -> None:
@@ -97,6 +101,9 @@ class RunWriter:
         }
         self._files: dict[str, _RowFile] = {}
         self._last_sync_s: float | None = None
+        from sonofix.geometry import tilting
+
+        self._tilts = bool(tilting(site).any())
 
     def __enter__(self) -> Self:
         """Make the folder and its files, with their first lines."""
@@ -109,6 +116,8 @@ class RunWriter:
             self.out.mkdir(parents=True, exist_ok=True)
         try:
             for name, header in COLUMNS.items():
+                if self._tilts and name in ("fixes.csv", "track.csv"):
+                    header = f"{header},{TILT_COLUMNS}"
                 self._files[name] = _RowFile(self.out / name, header.split(","), ",")
             for vehicle in self._site.vehicles:
                 self._files[f"tum {vehicle.id}"] = _RowFile(self.out / _tum_name(self._site, vehicle.id), None, " ")
@@ -142,7 +151,7 @@ class RunWriter:
         sync_s = step.ranges.sync_s
         self._files["ranges.csv"].add(_range_rows(step))
         self._files["fixes.csv"].add((fix.time_s, self._fix_row(fix, step.ranges)) for fix in step.fixes)
-        self._files["track.csv"].add((estimate.time_s, _track_row(estimate)) for estimate in step.estimates)
+        self._files["track.csv"].add((estimate.time_s, self._track_row(estimate)) for estimate in step.estimates)
         self._files["events.csv"].add((event.time_s, _event_row(event)) for event in step.events)
         for estimate in step.estimates:
             key = f"tum {estimate.vehicle}"
@@ -170,7 +179,26 @@ class RunWriter:
             *(_figure(_covariance(fix, a, b)) for a, b in ("xx", "xy", "yy", "zz")),
             *(_figure(value) for value in (fix.hdop, fix.vdop, fix.hpl_m, fix.vpl_m)),
             *map(str, (int(np.count_nonzero(heard)), used, excluded)),
+            *self._tilt(fix),
         ]
+
+    def _track_row(self, estimate: Estimate) -> list[str]:
+        return [
+            _time(estimate.time_s),
+            estimate.vehicle,
+            *(_length(value) for value in estimate.position_m),
+            *(_length(value) for value in estimate.velocity_mps),
+            _angle(estimate.yaw_rad),
+            *(_figure(estimate.sd(state)) for state in ("x", "y", "z", "yaw")),
+            estimate.source,
+            *self._tilt(estimate),
+        ]
+
+    def _tilt(self, of: Fix | Estimate) -> list[str]:
+        """Cells of `TILT_COLUMNS`, where the site has them."""
+        if not self._tilts:
+            return []
+        return [_angle(of.roll_rad), _angle(of.pitch_rad), *(_figure(of.sd(state)) for state in ("roll", "pitch"))]
 
     def _concerns(self, vehicle: str, ranges: RangeEpoch) -> NDArray[np.bool_]:
         """Say of each row whether one of its ends rides on the vehicle."""
@@ -302,23 +330,11 @@ def _range_rows(step: Step) -> Iterator[tuple[float, list[str]]]:
         )
 
 
-def _track_row(estimate: Estimate) -> list[str]:
-    return [
-        _time(estimate.time_s),
-        estimate.vehicle,
-        *(_length(value) for value in estimate.position_m),
-        *(_length(value) for value in estimate.velocity_mps),
-        _angle(estimate.yaw_rad),
-        *(_figure(estimate.sd(state)) for state in ("x", "y", "z", "yaw")),
-        estimate.source,
-    ]
-
-
 def _tum_row(estimate: Estimate) -> list[str]:
-    """Return `timestamp tx ty tz qx qy qz qw`; a heading that is not known is written as none turned."""
-    half = 0.5 * (estimate.yaw_rad or 0.0)
+    """Return `timestamp tx ty tz qx qy qz qw`; an angle that is not known is written as none turned."""
     place = [format(float(value), ".6f") for value in estimate.position_m]
-    return [_time(estimate.time_s), *place, "0", "0", format(math.sin(half), ".9f"), format(math.cos(half), ".9f")]
+    turned = quaternion(estimate.roll_rad or 0.0, estimate.pitch_rad or 0.0, estimate.yaw_rad or 0.0)
+    return [_time(estimate.time_s), *place, *(format(part, ".9f") if part else "0" for part in turned)]
 
 
 def _event_row(event: Event) -> list[str]:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE, Links, from_arm, link, open_arms
+from sonofix.geometry import PITCH, POSE, ROLL, YAW, Links, from_arm, link, open_arms, tilting
 from sonofix.locate.exclude import agrees, exclude
-from sonofix.locate.rows import Rows, Solution
+from sonofix.locate.rows import ROCKING_RADPS, Rows, Solution
 from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
@@ -19,13 +19,19 @@ Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 FLAT_M = 0.01
 """Two heights whose middle fits every range within this, or its deviation, are one position with an open height."""
 
+ONE_HEADING_RAD = 0.1
+"""Two solutions whose headings differ by less head alike."""
+
 AMBIGUOUS_CHI2 = 28.0
 """Two solutions whose χ² differ by less are both believed: wherever the two lie, noise prefers the wrong one by more
 with a probability of Q(√28) = 6e-8."""
 
 
 def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
-    """Solve for one vehicle's position, velocity where range rates are there, heading where microphones allow it.
+    """Solve for one vehicle's position, velocity where range rates are there, and attitude as microphones allow it.
+
+    Two ends on one body tell where it heads; a body that tilts (`geometry.tilting`) has roll and pitch solved for with
+    them, from 0 with the deviation that its site states: three ends that are not on one line tell both.
 
     Rows whose other end is fixed are used; rows between vehicles are left to the track. Where all ranges share an
     unknown clock it is solved for beside the position, which equals TDoA with its full covariance.
@@ -44,14 +50,24 @@ def fix(epoch: RangeEpoch, site: Site, vehicle: str) -> Fix:
     """
     who = [v.id for v in site.vehicles].index(vehicle)
     links, level_m = link(site, epoch.emitter, epoch.receiver), site.vehicles[who].z_m
-    return judged(epoch, links, who, vehicle, level_m, site.bounds_m, open_arms(site)[who])
+    return judged(epoch, links, who, vehicle, level_m, site.bounds_m, open_arms(site)[who], float(tilting(site)[who]))
 
 
 def judged(
-    epoch: RangeEpoch, links: Links, who: int, vehicle: str, level_m: float | None, bounds_m: Bounds | None, arm: Floats
+    epoch: RangeEpoch,
+    links: Links,
+    who: int,
+    vehicle: str,
+    level_m: float | None,
+    bounds_m: Bounds | None,
+    arm: Floats,
+    tilt_sd_rad: float = 0.0,
 ) -> Fix:
-    """Do as `fix`, with what it asks of a site looked up: ends of rows, level, room, the arm that no heading places."""
-    solver = Rows(epoch, links, who, level_m)
+    """Do as `fix`, with what it asks of a site looked up.
+
+    That is ends of rows, level, room, the arm that no heading places, and how far the body tilts.
+    """
+    solver = Rows(epoch, links, who, level_m, tilt_sd_rad)
     rows, time_s = solver.rows, solver.time_s
     if len(rows) < solver.needed:
         text = f"{len(rows)} of {solver.needed} ranges; bring more beacons in reach or state what is known (z_m)"
@@ -82,11 +98,12 @@ def judged(
     if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
         text = "the beacons in reach leave a direction open; spread them off one line or plane"
         return _failed(epoch, vehicle, time_s, "no-convergence", text)
+    covariance = covariance + solver.bent(kept, best, covariance)
     hpl_m = vpl_m = None
     if status == "ok":
         hpl_m, vpl_m = solver.protection(kept, best, [s for s in found if s is not best], bounds_m)
-    if mirror is not None and bounds_m is None and solver.level_m is None:
-        best, covariance = _between(best, mirror, covariance)
+    if mirror is not None and solver.level_m is None and (bounds_m is None or _inside(mirror, bounds_m)):
+        best, covariance = _between(best, mirror, covariance, solver.components)
     states = tuple(POSE[i] for i in solver.components) + ("clock",) * solver.clock
     used = np.zeros(len(epoch), bool)
     used[rows[kept]] = True
@@ -95,6 +112,10 @@ def judged(
     residual[rows], hdop, vdop = solver.look(kept, best)
     arm = solver.open_arm + arm
     position, covariance = _shift_to_origin(best, covariance * inflation, arm)
+    aside_m, along_m = 0.0, 0.0
+    if solver.swing_rad:
+        aside_m, along_m = float(np.hypot(*arm)), solver.reach_up_m
+        covariance = _swung(covariance, states, aside_m, along_m, solver.swing_rad)
     return Fix(
         time_s=time_s,
         vehicle=vehicle,
@@ -103,19 +124,21 @@ def judged(
         states=states,
         position_m=position,
         velocity_mps=best.state[4:7].copy() if solver.rates else None,
-        yaw_rad=float(best.state[3]) if solver.turns else None,
+        yaw_rad=float(best.state[YAW]) if solver.turns else None,
         clock_offset_m=best.clock_m if solver.clock else None,
         covariance=covariance,
         hdop=hdop,
         vdop=vdop,
-        # a lever arm of open heading may point anywhere
-        hpl_m=None if hpl_m is None else hpl_m + 2.0 * float(np.hypot(*arm)),
-        vpl_m=vpl_m,
+        # a lever arm of open heading may point anywhere, and one of a body that tilts up or down
+        hpl_m=None if hpl_m is None else hpl_m + 2.0 * float(np.hypot(*arm)) + float(along_m),
+        vpl_m=None if vpl_m is None else vpl_m + float(max(aside_m, 2.0 * along_m)),
         used=used,
         residual_m=residual,
         mirror_m=mirror_m,
         sound_speed_mps=speed_mps,
         sound_speed_sd_mps=speed_sd_mps,
+        roll_rad=_angle(best.state[ROLL]) if solver.tilts else None,
+        pitch_rad=_angle(best.state[PITCH]) if solver.tilts else None,
     )
 
 
@@ -128,26 +151,48 @@ def _tell_apart(
     """
     if not rivals:
         return best, None, False
+    close = _close(best, rivals[0], epoch, kept)
     if bounds_m is None:
-        apart = best.position_m - rivals[0].position_m
-        range_m = abs(float(np.median(epoch.range_m[kept])))
-        seen_m = max(FLAT_M, float(np.median(np.sqrt(np.diag(epoch.covariance_m2)[kept]))))
-        close = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * range_m) < seen_m
         return best, rivals[0], len(rivals) > 1 or not close
-    low, high = np.array(bounds_m)
-    inside = [s for s in [best, *rivals] if np.all(s.position_m >= low - 0.1) and np.all(s.position_m <= high + 0.1)]
+    inside = [s for s in [best, *rivals] if _inside(s, bounds_m)]
+    if len(inside) == 2 and inside[1] is rivals[0] and close and bool(best.state[ROLL] or best.state[PITCH]):
+        return best, rivals[0], False
     if len(inside) != 1:
         return best, rivals[0], True
     others = [s for s in [best, *rivals] if s is not inside[0]]
     return inside[0], others[0], False
 
 
-def _between(best: Solution, mirror: Solution, covariance: Floats) -> tuple[Solution, Floats]:
-    """Return the middle of two solutions just above each other; half their distance is the height's deviation."""
+def _inside(found: Solution, bounds_m: Bounds) -> bool:
+    low, high = np.array(bounds_m)
+    return bool(np.all(found.position_m >= low - 0.1) and np.all(found.position_m <= high + 0.1))
+
+
+def _close(best: Solution, other: Solution, epoch: RangeEpoch, kept: NDArray[np.int64]) -> bool:
+    """Whether two solutions are one above the other, heading alike, so near that no range tells of their middle."""
+    apart = best.position_m - other.position_m
+    range_m = abs(float(np.median(epoch.range_m[kept])))
+    seen_m = max(FLAT_M, float(np.median(np.sqrt(np.diag(epoch.covariance_m2)[kept]))))
+    near = np.hypot(apart[0], apart[1]) < 0.02 and (apart[2] / 2) ** 2 / (2 * range_m) < seen_m
+    return bool(near) and abs(_angle(best.state[YAW] - other.state[YAW])) < ONE_HEADING_RAD
+
+
+def _between(
+    best: Solution, mirror: Solution, covariance: Floats, components: tuple[int, ...]
+) -> tuple[Solution, Floats]:
+    """Return the middle of two solutions just above each other; half their distance is the height's deviation.
+
+    Those of a body that tilts differ in attitude too: the middle of both, with the covariance of their mixture.
+    """
+    state, wider = best.state.copy(), covariance.copy()
+    if ROLL in components:
+        half = (best.state - mirror.state) / 2
+        half[[YAW, ROLL, PITCH]] = [_angle(2 * angle) / 2 for angle in half[[YAW, ROLL, PITCH]]]
+        own = list(components)
+        wider[: len(own), : len(own)] += np.outer(half[own], half[own])
+        return replace(best, state=state - half), wider
     half_m = (best.state[2] - mirror.state[2]) / 2
-    state = best.state.copy()
     state[2] -= half_m
-    wider = covariance.copy()
     wider[2, :] = wider[:, 2] = 0.0
     wider[2, 2] = half_m**2 + covariance[2, 2]
     return replace(best, state=state), wider
@@ -167,6 +212,21 @@ def _shift_to_origin(best: Solution, covariance: Floats, arm: Floats) -> tuple[F
     position[:2] += shift
     covariance[:2, :2] += np.eye(2) * sd_m**2
     return position, covariance
+
+
+def _swung(covariance: Floats, states: tuple[str, ...], aside_m: float, along_m: float, tilt_sd_rad: float) -> Floats:
+    """Widen a covariance for ends ``aside_m`` off a body's axis and ``along_m`` up it, whose tilt nothing tells."""
+    out = covariance.copy()
+    for axis, arm_m in (("x", along_m), ("y", along_m), ("z", aside_m)):
+        for name, swing_m in ((axis, tilt_sd_rad * arm_m), (f"v{axis}", ROCKING_RADPS * arm_m)):
+            if name in states:
+                out[states.index(name), states.index(name)] += swing_m**2
+    return out
+
+
+def _angle(angle_rad: float) -> float:
+    """Return the same angle between −π and π."""
+    return float(np.angle(np.exp(1j * angle_rad)))
 
 
 def _failed(epoch: RangeEpoch, vehicle: str, time_s: float, status: FixStatus, remedy: str) -> Fix:

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import SAME_ARM_M, Links, expected
+from sonofix.geometry import ALONE, CLOCK, PITCH, PITCH_RATE, ROLL, ROLL_RATE, SAME_ARM_M, SIZE, YAW, Links, expected
 from sonofix.locate.dense import spread, whitener
 from sonofix.locate.integrity import RISK, levels, threshold
 from sonofix.locate.noise import CLOCK_SPEED_SD, row_noise
@@ -21,10 +21,13 @@ from sonofix.records import Floats, RangeEpoch
 UNKNOWN_SPEED_MPS = 1.0
 """Deviation of the velocity (from 0) where no range rates tell of it: a walk."""
 
+ROCKING_RADPS = 2.0
+"""How fast a body that tilts rocks, one sigma."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """Where a descent came to rest: state (10,) as `solve.misfit` has it, whitened χ² and Jacobian (m, k)."""
+    """Where a descent came to rest: state (ALONE,) as `solve.misfit` has it, whitened χ² and Jacobian (m, k)."""
 
     state: Floats
     chi2: float
@@ -38,7 +41,7 @@ class Solution:
     @property
     def clock_m(self) -> float:
         """Offset that all ranges share."""
-        return float(self.state[8])
+        return float(self.state[CLOCK])
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -107,13 +110,13 @@ def look(rows, c, clock, index, state, kept, residual):
     """
     ends, dt, measured = rows
     n, places, in_space = len(dt), 0, False
-    value, derivative = np.empty(n), np.empty((n, 10))
+    value, derivative = np.empty(n), np.empty((n, ALONE))
     expected(ends, state, dt, c, clock, value, derivative)
     for i in range(n):
         residual[i] = measured[i] - value[i]
     chosen = np.empty(len(index), np.int64)
     for j in index:
-        if j < 4 or j == 8:
+        if j <= YAW or j in (ROLL, PITCH, CLOCK):
             chosen[places] = j
             places += 1
             in_space |= j == 2
@@ -140,9 +143,13 @@ class Rows:
         The vehicle's index in the site.
     level_m : float or None
         The vehicle's level, where known.
+    tilt_sd_rad : float
+        Deviation of its roll and pitch before anything is heard; 0: it stands upright.
     """
 
-    def __init__(self, epoch: RangeEpoch, links: Links, who: int, level_m: float | None) -> None:
+    def __init__(
+        self, epoch: RangeEpoch, links: Links, who: int, level_m: float | None, tilt_sd_rad: float = 0.0
+    ) -> None:
         self.clock, self.rates = epoch.clock == "common", epoch.range_rate_mps is not None
         self.level_m = level_m
         self._speed_mps = float(epoch.sound_speed_mps)
@@ -150,9 +157,13 @@ class Rows:
             links.ends, who, epoch.time_s, epoch.range_m, self.clock, self._speed_mps
         )
         self.time_s = middle_s if len(self.rows) else epoch.sync_s
-        places = [0, 1] + [2] * (level_m is None) + [3] * self.turns
+        places = [0, 1] + [2] * (level_m is None) + [YAW] * self.turns
         self.needed = len(places) + self.clock
-        self._index = np.array(places + [4 + p for p in places if self.rates] + [8] * self.clock)
+        # ends on one vertical line tell no heading, without which roll and pitch mean nothing
+        self.tilts = self.turns and tilt_sd_rad > 0.0
+        tilt, rocking = [ROLL, PITCH] * self.tilts, [ROLL_RATE, PITCH_RATE] * (self.tilts and self.rates)
+        rates = [4 + p for p in places if self.rates]
+        self._index = np.array(places + tilt + rates + rocking + [CLOCK] * self.clock)
         self.range_m = self._measured = epoch.range_m[self.rows]
         if epoch.range_rate_mps is not None:
             self._measured = np.concatenate([self.range_m, epoch.range_rate_mps[self.rows]])
@@ -160,15 +171,29 @@ class Rows:
         self._speed_sd_mps = float(epoch.sound_speed_sd_mps)
         self._flight_m = flights_m(epoch.range_m, self.clock)[self.rows]
         self._covariance = row_noise(epoch, links, self.rows, self._dt, speed_sd, clock_sd)
+        self.swing_rad = 0.0 if self.turns else tilt_sd_rad
+        self._before = len(tilt) + len(rocking)
+        if self._before:
+            m, known = len(self._covariance), [tilt_sd_rad] * len(tilt) + [ROCKING_RADPS] * len(rocking)
+            self._measured = np.append(self._measured, np.zeros(len(known)))
+            whole = np.zeros((m + len(known),) * 2)
+            whole[:m, :m], whole[m:, m:] = self._covariance, np.diag(np.square(known))
+            self._covariance = whole
 
     @property
     def components(self) -> tuple[int, ...]:
         """Which components of `geometry.POSE` are solved for."""
-        return tuple(int(j) for j in self._index if j < 8)
+        return tuple(int(j) for j in self._index if j < SIZE)
 
     def degrees(self, count: int) -> int:
         """Degrees of freedom of so many rows: measurements (ranges, and rates where there are any) less unknowns."""
-        return count * (2 if self.rates else 1) - len(self._index)
+        return count * (2 if self.rates else 1) + self._before - len(self._index)
+
+    @property
+    def reach_up_m(self) -> float:
+        """How far above or below the origin of the body the ends are that were heard: the most of it."""
+        _, sent_at, heard, heard_at = self._ends
+        return float(np.abs(np.where(heard == 0, heard_at[:, 2], sent_at[:, 2])).max(initial=0.0))
 
     def candidates(self, rows: NDArray[np.int64]) -> list[Solution]:
         """Solutions from all starts, best first, none twice.
@@ -180,7 +205,7 @@ class Rows:
         """
         kept, covariance = self._kept(rows)
         m, flat = len(covariance), self.level_m is not None
-        states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, m, len(self._index)))
+        states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, m, len(self._index)))
         at = (
             kept,
             self._speed_mps,
@@ -199,7 +224,8 @@ class Rows:
         """Return a selection's rows as kernels take them, and their covariance."""
         if len(rows) == len(self._dt):
             return (self._ends, self._dt, self._measured), self._covariance
-        both = np.concatenate([rows, rows + len(self._dt)]) if self.rates else rows
+        before = np.arange(len(self._measured) - self._before, len(self._measured))
+        both = np.concatenate([rows, rows + len(self._dt), before] if self.rates else [rows, before])
         ends = tuple(part[rows] for part in self._ends)
         return (ends, self._dt[rows], self._measured[both]), np.ascontiguousarray(self._covariance[both[:, None], both])
 
@@ -210,7 +236,7 @@ class Rows:
         -------
         position_m, chi2 : float64 (q, 3), (q,)
         """
-        states, chi2s = np.empty((len(choices), 10)), np.empty(len(choices))
+        states, chi2s = np.empty((len(choices), ALONE)), np.empty(len(choices))
         rows = (self._ends, self._dt, self._measured)
         at = (self._speed_mps, self.clock, self._covariance, self._index)
         without(rows, *at, choices, found.state, states, chi2s)
@@ -227,6 +253,31 @@ class Rows:
         """Covariance (k, k) of what is solved for; None where it leaves a direction open."""
         out = np.empty((len(self._index),) * 2)
         return out if spread(found.jacobian, out) else None
+
+    def bent(self, kept: NDArray[np.int64], found: Solution, covariance: Floats) -> Floats:
+        """What the bend of rows over the reach of roll and pitch adds to a covariance (k, k): a second-order term.
+
+        A tilt that rows tell poorly swings ends on arcs, which the linear model takes for straight. All unknowns move
+        with it as their covariance has it; what rows then show beyond the linear model, h = ½ H ξ² with ξ of unit
+        variance and E(h²) = ¾ H², is noise of the rows (Bar-Shalom 2001, section 10.3.2).
+        """
+        if not self.tilts:
+            return np.zeros_like(covariance)
+        (rows, noise), unknowns = self._kept(kept), self._index
+        tilt = np.isin(unknowns, (ROLL, PITCH))
+        size, axes = np.linalg.eigh(covariance[np.ix_(tilt, tilt)])
+        at = np.zeros((5, len(noise)))
+        whiten, plain, jacobian = np.empty_like(noise), np.empty(len(noise)), np.empty_like(found.jacobian)
+        whitener(noise, whiten)
+        for i, side in enumerate((0.0, 1.0, -1.0, 1.0, -1.0)):
+            state, along = found.state.copy(), axes[:, max(i - 1, 0) // 2]
+            reach = np.sqrt(size[max(i - 1, 0) // 2])
+            state[unknowns] += side * covariance[:, tilt] @ along / reach
+            misfit(rows, self._speed_mps, self.clock, whiten, unknowns, state, plain, at[i], jacobian)
+        bends = (at[1::2] + at[2::2]) / 2 - at[0]
+        moved = covariance @ found.jacobian.T @ bends.T
+        # both ways of tilting bend together at worst
+        return 6.0 * moved @ moved.T
 
     def sound_speed(self, kept: NDArray[np.int64], found: Solution) -> tuple[float, float] | None:
         """Sound speed and its deviation by the rows kept, with the epoch's own as the prior; None where that is exact.
@@ -268,7 +319,8 @@ class Rows:
         covariance, left_out = self._kept(kept)[1], len(self._dt) - len(kept)
         whiten = np.empty_like(covariance)
         whitener(covariance, whiten)
-        groups, faults = np.arange(len(whiten)).reshape(-1, len(kept)).T, max(1, left_out)
+        told = np.arange(len(whiten) - self._before)
+        groups, faults = told.reshape(-1, len(kept)).T, max(1, left_out)
         hpl, vpl = levels(
             found.jacobian,
             whiten,

@@ -9,16 +9,22 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.geometry import expected
+from sonofix.geometry import ALONE, CLOCK, PITCH, PITCH_RATE, ROLL, YAW, expected
 from sonofix.locate.dense import principal, spread, whitener
-from sonofix.locate.solve import alike, descend, misfit
+from sonofix.locate.solve import alike, beforehand, descend, misfit
 from sonofix.locate.start import MOST_STARTS, begin
 
 YAW_STARTS = 12
 """Headings looked at from each starting place."""
 
-MOST = 2 * (MOST_STARTS + 1)
-"""Solutions there may be: from each start and a mirror image, by two headings."""
+LEAN_STARTS, LEAN_RAD = 6, 0.7
+"""Ways that a body which tilts is tried leant over, and how far."""
+
+MOST = (2 + LEAN_STARTS) * (MOST_STARTS + 1) + LEAN_STARTS
+"""Solutions there may be: from each start and a mirror image, by two headings and leant over; and so from the best."""
+
+REDUNDANT = 3
+"""A body that tilts has one attitude that fits where rows are so many times the unknowns; else others are sought."""
 
 NEARLY_FLAT = 0.3
 """Anchors that spread less across than this share of their widest spread may have nearly a mirror solution."""
@@ -35,7 +41,7 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
     ----------
     flat : bool
         The level is known, as ``level_m``, which is not looked at otherwise.
-    states, chi2s, jacobians : float64 (MOST, 10), (MOST,) and (MOST, m, k), out
+    states, chi2s, jacobians : float64 (MOST, ALONE), (MOST,) and (MOST, m, k), out
 
     Returns
     -------
@@ -54,11 +60,13 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
         for axis in range(3):
             anchors[i, axis] = emitter_point[i, axis] if listening else receiver_point[i, axis]
         anchors[i, 2] -= receiver_point[i, 2] if listening else emitter_point[i, 2]
-    turns = False
-    for j in range(len(index)):
-        turns |= index[j] == 3
-    begins, state, yaws = np.empty((MOST_STARTS + 1, 4)), np.empty(10), np.zeros(2)
+    turns, tilts = False, False
+    for j in index:
+        turns |= j == YAW
+        tilts |= j == ROLL
+    begins, state, attitudes = np.empty((MOST_STARTS + 1, 4)), np.empty(ALONE), np.zeros((2, 3))
     count, found = begin(anchors, measured[:n], flat, level_m, clock, begins), 0
+    scarce = tilts and m < REDUNDANT * len(index)
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, len(index)))
     for b in range(MOST_STARTS + 1):
         if b > count or (b == count and not found):
@@ -67,31 +75,63 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
             # anchors nearly in one plane have nearly a mirror solution, which the linear start may have missed, or hit
             for axis in range(3):
                 begins[b, axis] = states[0, axis]
-            begins[b, 3] = states[0, 8]
+            begins[b, 3] = states[0, CLOCK]
             if not mirror(begins[b], anchors, 2 if flat else 3) and not turns:
                 break
         if turns:
-            _yaws(rows, c, clock, whiten, begins[b], yaws)
-        for k in range(2 if turns else 1):
+            _attitudes(rows, c, clock, whiten, begins[b], tilts, attitudes)
+        for k in range((2 + LEAN_STARTS if scarce else 2) if turns else 1):
             state[:] = 0.0
             for axis in range(3):
                 state[axis] = begins[b, axis]
-            state[3], state[8] = yaws[k], begins[b, 3]
+            state[YAW], state[ROLL], state[PITCH] = attitudes[k if k < 2 else 0]
+            if k >= 2:
+                _lean(k - 2, state)
+            state[CLOCK] = begins[b, 3]
             known = states[:found]
             chi2, rests = descend(rows, c, clock, whiten, index, known, STEPS, state, plain, miss, jacobian)
             if rests:
+                if tilts:
+                    _least_turned(state)
                 found = _insert(states, chi2s, found, state, chi2)
+    for lean in range(LEAN_STARTS if scarce and found else 0):
+        for j in range(ALONE):
+            state[j] = states[0, j]
+        _lean(lean, state)
+        chi2, rests = descend(rows, c, clock, whiten, index, states[:found], STEPS, state, plain, miss, jacobian)
+        if rests:
+            _least_turned(state)
+            found = _insert(states, chi2s, found, state, chi2)
     kept = 0
     for i in range(found):
         new = True
         for k in range(kept):
             new &= not alike(states[i], states[k], 0.01, 0.02)
         if new:
-            for j in range(10):
+            for j in range(ALONE):
                 states[kept, j] = states[i, j]
             chi2s[kept] = misfit(rows, c, clock, whiten, index, states[kept], plain, miss, jacobians[kept])
             kept += 1
     return kept
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lean(lean, state):
+    """Lean a state over, in place, one of `LEAN_STARTS` ways."""
+    way = lean * (2 * np.pi / LEAN_STARTS)
+    state[ROLL], state[PITCH] = LEAN_RAD * np.cos(way), LEAN_RAD * np.sin(way)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _least_turned(state):
+    """Bring pitch within ±90° and roll within ±180°, in place: each attitude has two sets of angles."""
+    for j in (ROLL, PITCH):
+        state[j] -= 2 * np.pi * np.floor(state[j] / (2 * np.pi) + 0.5)
+    if abs(state[PITCH]) > np.pi / 2:
+        state[YAW] += np.pi
+        state[PITCH] = (np.pi if state[PITCH] > 0.0 else -np.pi) - state[PITCH]
+        state[PITCH_RATE] = -state[PITCH_RATE]
+        state[ROLL] += np.pi if state[ROLL] <= 0.0 else -np.pi
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -100,11 +140,11 @@ def _insert(states, chi2s, count, state, chi2):
     at = count
     while at > 0 and chi2s[at - 1] > chi2:
         chi2s[at] = chi2s[at - 1]
-        for j in range(10):
+        for j in range(ALONE):
             states[at, j] = states[at - 1, j]
         at -= 1
     chi2s[at] = chi2
-    for j in range(10):
+    for j in range(ALONE):
         states[at, j] = state[j]
     return count + 1
 
@@ -123,29 +163,49 @@ def mirror(place, anchors, dims):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _yaws(rows, c, clock, whiten, place, out):
-    """Headings worth starting from at a place: the best of a round by ranges alone, and its best rival well away."""
+def _attitudes(rows, c, clock, whiten, place, tilts, out):
+    """Yaw, roll and pitch worth starting from at a place, (2, 3): the best by ranges alone, its best rival well away.
+
+    Looked at are a round of headings, upright, and where the body ``tilts`` those two leant over every way.
+    """
     ends, dt, measured = rows
-    n = len(dt)
-    state, misfits, best = np.zeros(10), np.zeros(YAW_STARTS), 0
-    state[0], state[1], state[2], state[8] = place[0], place[1], place[2], place[3]
-    value, derivative = np.empty(n), np.empty((n, 10))
+    n, turn = len(dt), 2 * np.pi / YAW_STARTS
+    state, misfits, best, rival = np.zeros(ALONE), np.zeros(YAW_STARTS), 0, -1
+    state[0], state[1], state[2], state[CLOCK] = place[0], place[1], place[2], place[3]
+    value, derivative = np.empty(n), np.empty((n, ALONE))
     for y in range(YAW_STARTS):
-        state[3] = y * (2 * np.pi / YAW_STARTS)
+        state[YAW] = y * turn
         expected(ends, state, dt, c, clock, value, derivative)
-        for i in range(n):
-            miss = 0.0
-            for k in range(i + 1):
-                miss += whiten[i, k] * (measured[k] - value[k])
-            misfits[y] += miss**2
+        misfits[y] = _square(measured, value, whiten)
         if misfits[y] < misfits[best]:
             best = y
-    rival = -1
     for y in range(YAW_STARTS):
-        apart = min(abs(y - best), YAW_STARTS - abs(y - best)) * (2 * np.pi / YAW_STARTS)
+        apart = min(abs(y - best), YAW_STARTS - abs(y - best)) * turn
         if apart > 1.0 and (rival < 0 or misfits[y] < misfits[rival]):
             rival = y
-    out[0], out[1] = best * (2 * np.pi / YAW_STARTS), rival * (2 * np.pi / YAW_STARTS)
+    for k in range(2):
+        y = best if k == 0 else rival
+        out[k, 0], out[k, 1], out[k, 2] = y * turn, 0.0, 0.0
+        least = misfits[y]
+        for lean in range(LEAN_STARTS if tilts else 0):
+            state[YAW] = y * turn
+            _lean(lean, state)
+            expected(ends, state, dt, c, clock, value, derivative)
+            square = _square(measured, value, whiten)
+            if square < least:
+                least, out[k, 1], out[k, 2] = square, state[ROLL], state[PITCH]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _square(measured, value, whiten):
+    """χ² of ranges."""
+    square = 0.0
+    for i in range(len(value)):
+        miss = 0.0
+        for k in range(i + 1):
+            miss += whiten[i, k] * (measured[k] - value[k])
+        square += miss**2
+    return square
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -156,19 +216,26 @@ def without(rows, c, clock, covariance, index, choices, begin_at, states, chi2s)
     ----------
     choices : int64 (q, p)
         Rows to keep, each time.
-    begin_at : float64 (10,)
-    states, chi2s : float64 (q, 10) and (q,), out
+    begin_at : float64 (ALONE,)
+    states, chi2s : float64 (q, ALONE) and (q,), out
     """
-    count, m = choices.shape[1], len(rows[2]) // len(rows[1]) * choices.shape[1]
+    count, m = choices.shape[1], size(rows, index, choices.shape[1])
     part, whiten = np.empty((m, m)), np.empty((m, m))
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, len(index)))
-    kept, known = room(count, m), np.empty((0, 10))
+    kept, known = room(count, m), np.empty((0, ALONE))
     for q in range(len(choices)):
-        keep(rows, covariance, choices[q], kept, part)
+        keep(rows, covariance, choices[q], beforehand(index), kept, part)
         whitener(part, whiten)
-        for j in range(10):
+        for j in range(ALONE):
             states[q, j] = begin_at[j]
         chi2s[q], _ = descend(kept, c, clock, whiten, index, known, STEPS, states[q], plain, miss, jacobian)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def size(rows, index, count):
+    """How many measurements so many of all rows have, with what is known `beforehand`."""
+    before = beforehand(index)
+    return (len(rows[2]) - before) // len(rows[1]) * count + before
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -179,16 +246,20 @@ def room(count, m):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def keep(rows, covariance, choice, kept, part):
-    """Fill ``kept`` and ``part`` (m, m) with some of the rows and their covariance."""
+def keep(rows, covariance, choice, before, kept, part):
+    """Fill ``kept`` and ``part`` (m, m) with some of the rows, ``before`` of them `beforehand`, and covariance."""
     ends, dt, measured = rows
     kept_ends, kept_dt, kept_measured = kept
     n, count = len(dt), len(choice)
-    for i in range(len(kept_measured)):
-        a = choice[i % count] + i // count * n
-        kept_measured[i] = measured[a]
-        for k in range(len(kept_measured)):
-            part[i, k] = covariance[a, choice[k % count] + k // count * n]
+    source = np.empty(len(kept_measured), np.int64)
+    for i in range(len(source)):
+        # what is known beforehand stands behind ranges and rates of every selection
+        behind = i - (len(source) - before)
+        source[i] = choice[i % count] + i // count * n if behind < 0 else len(measured) - before + behind
+    for i in range(len(source)):
+        kept_measured[i] = measured[source[i]]
+        for k in range(len(source)):
+            part[i, k] = covariance[source[i], source[k]]
     for i in range(count):
         row = choice[i]
         kept_ends[0][i], kept_ends[2][i], kept_dt[i] = ends[0][row], ends[2][row], dt[row]
@@ -206,7 +277,7 @@ def rivals(rows, c, clock, covariance, index, flat, level_m, kept, best, limit, 
     Parameters
     ----------
     kept : int64 (p,)
-    best : float64 (10,)
+    best : float64 (ALONE,)
         The solution of them all.
     limit : float
         χ² up to which another is allowed.
@@ -217,15 +288,15 @@ def rivals(rows, c, clock, covariance, index, flat, level_m, kept, best, limit, 
     bounds_m : float64 (2, 3)
         Solutions outside are none; infinite where no room is known.
     """
-    count, m = len(kept) - 1, len(rows[2]) // len(rows[1]) * (len(kept) - 1)
+    count, m = len(kept) - 1, size(rows, index, len(kept) - 1)
     part, fewer, choice = np.empty((m, m)), room(count, m), np.empty(count, np.int64)
-    states, chi2s, jacobians = np.empty((MOST, 10)), np.empty(MOST), np.empty((MOST, m, len(index)))
+    states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, m, len(index)))
     deviation, sd = np.empty((len(index), len(index))), np.empty(3)
     away[:] = 0.0
     for left_out in range(len(kept)):
         for i in range(count):
             choice[i] = kept[i + (i >= left_out)]
-        keep(rows, covariance, choice, fewer, part)
+        keep(rows, covariance, choice, beforehand(index), fewer, part)
         found = search(fewer, c, clock, part, index, flat, level_m, states, chi2s, jacobians)
         own, nearest = -1, np.inf
         for s in range(found):

@@ -5,11 +5,28 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.geometry import expected
+from sonofix.geometry import ALONE, PITCH, ROLL, SIZE, YAW, expected
 from sonofix.locate.dense import factor, substitute
+
+UNUSUAL = 3.0
+"""Deviations that a tilt counts for at most."""
 
 SAME = 1e-3
 """A descent that comes within so many metres and radians of where an earlier one came to rest ends there."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def beforehand(index):
+    """How many unknowns are roughly known before anything is heard: angles of tilt and their rates.
+
+    Each has a row of its own behind those measured, which says that it is 0 with its deviation. What is many of these
+    off is as unlikely as what is `UNUSUAL`: that a body leans over is no fault of a range.
+    """
+    count = 0
+    for j in index:
+        if ROLL <= j < SIZE:
+            count += 1
+    return count
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -19,12 +36,13 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
     Parameters
     ----------
     rows : tuple
-        ``ends`` as `geometry.expected` takes them, ``dt`` (n,), and what was measured (m,): ranges, then rates if any.
+        ``ends`` as `geometry.expected` takes them, ``dt`` (n,), and what was measured (m,): ranges, then rates if any,
+        then 0 for each of `beforehand`.
     whiten : float64 (m, m)
         Lower triangular.
     index : int64 (k,)
         Which of ``state`` are unknown.
-    state : float64 (10,)
+    state : float64 (ALONE,)
         One vehicle's pose, then clock offset and drift.
     plain, miss : float64 (m,), out
         Measured less expected, and the same whitened.
@@ -33,8 +51,17 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
     """
     ends, dt, measured = rows
     m = len(measured)
-    derivative = np.empty((m, 10))
-    expected(ends, state, dt, c, clock, plain, derivative)
+    derivative = np.empty((m, ALONE))
+    last = m - beforehand(index)
+    expected(ends, state, dt, c, clock, plain[:last], derivative[:last])
+    for j in index:
+        if ROLL <= j < SIZE:
+            most = UNUSUAL / whiten[last, last]
+            share = np.tanh(state[j] / most)
+            plain[last] = most * share
+            derivative[last] = 0.0
+            derivative[last, j] = 1.0 - share**2
+            last += 1
     chi2 = 0.0
     for i in range(m):
         plain[i] = measured[i] - plain[i]
@@ -52,26 +79,29 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def alike(a, b, place_m, yaw_rad):
+def alike(a, b, place_m, turn_rad):
     """Whether two states are one within so much."""
     square = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
-    turn = a[3] - b[3]
-    turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
-    return square < place_m**2 and abs(turn) < yaw_rad
+    same = square < place_m**2
+    for j in (YAW, ROLL, PITCH):
+        turn = a[j] - b[j]
+        turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
+        same &= abs(turn) < turn_rad
+    return same
 
 
 @numba.njit(cache=True, error_model="numpy")
 def descend(rows, c, clock, whiten, index, known, iterations, state, plain, miss, jacobian):
     """Descend from ``state``, in place, until the step is far below the deviation of what is solved for.
 
-    Arguments as of `misfit`; ``known`` (q, 10) are states found earlier. Returns χ² and whether it came to rest, and
+    Arguments as of `misfit`; ``known`` (q, ALONE) are states found earlier. Returns χ² and whether it came to rest, and
     not where one is known.
     """
     m, count = len(miss), len(index)
     chi2 = misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian)
     new_plain, new_miss, new_jacobian = np.empty(m), np.empty(m), np.empty((m, count))
     normal, step, size = np.empty((count, count)), np.empty(count), np.empty(count)
-    tried = np.empty(10)
+    tried = np.empty(ALONE)
     damping, gained, new_chi2 = 1e-6, np.inf, np.inf
     for _ in range(iterations):
         for k in range(len(known)):
@@ -95,7 +125,7 @@ def descend(rows, c, clock, whiten, index, known, iterations, state, plain, miss
         downhill = factor(normal)
         if downhill:
             substitute(normal, step)
-            for j in range(10):
+            for j in range(ALONE):
                 tried[j] = state[j]
             for j in range(count):
                 tried[index[j]] += step[j] / size[j]
@@ -108,7 +138,7 @@ def descend(rows, c, clock, whiten, index, known, iterations, state, plain, miss
             continue
         gained = chi2 - new_chi2
         chi2, damping = new_chi2, damping / 10
-        for j in range(10):
+        for j in range(ALONE):
             state[j] = tried[j]
         for i in range(m):
             plain[i], miss[i] = new_plain[i], new_miss[i]

@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 
-from sonofix.geometry import POSE, link, model, row_times
+from sonofix.geometry import PITCH, ROLL, SIZE, YAW, link, model, row_times
 from sonofix.locate.fix import fix
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.site import Site
@@ -137,9 +137,10 @@ def _sense(
     epoch: RangeEpoch, site: Site, at: Fix, own: list[int], may_be: Sequence[list[tuple[str, float]]]
 ) -> list[tuple[int, str, float]]:
     """Each row as that of what it may be which a position explains best, if any."""
-    pose = np.zeros((len(site.vehicles), len(POSE)))
+    pose = np.zeros((len(site.vehicles), SIZE))
     who = [v.id for v in site.vehicles].index(at.vehicle)
-    pose[who, :3], pose[who, 3] = _place(at), at.yaw_rad or 0.0
+    pose[who, :3], pose[who, YAW] = _place(at), at.yaw_rad or 0.0
+    pose[who, ROLL], pose[who, PITCH] = at.roll_rad or 0.0, at.pitch_rad or 0.0
     if at.velocity_mps is not None:
         pose[who, 4:7] = at.velocity_mps
     # where the heading is open, an end off the axis may be anywhere round it

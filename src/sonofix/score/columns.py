@@ -34,7 +34,8 @@ class TrackColumns:
     """The track of one vehicle's origin: ``time_s`` and ``yaw_rad`` (n,), ``position_m`` and ``velocity_mps`` (n, 3).
 
     ``covariance_m2`` (n, 3, 3) is that of the position; NaN in all that is not known. Where a file holds only standard
-    deviations it is diagonal.
+    deviations it is diagonal. ``roll_rad``, ``pitch_rad`` (n,) and ``attitude_sd_rad`` (n, 3), of roll, pitch and yaw,
+    are None where no vehicle tilts.
     """
 
     time_s: Floats
@@ -42,6 +43,9 @@ class TrackColumns:
     velocity_mps: Floats
     yaw_rad: Floats
     covariance_m2: Floats
+    roll_rad: Floats | None = None
+    pitch_rad: Floats | None = None
+    attitude_sd_rad: Floats | None = None
 
 
 def range_columns(steps: Iterable[Step]) -> RangeColumns:
@@ -83,10 +87,23 @@ def _columns(rows: list[Estimate]) -> TrackColumns:
         axes = [k for k, name in enumerate("xyz") if name in row.states]
         places = [row.states.index("xyz"[k]) for k in axes]
         covariance[i][np.ix_(axes, axes)] = row.covariance[np.ix_(places, places)]
+    tilt: dict[str, Floats] = {}
+    if any(row.roll_rad is not None for row in rows):
+        sds = [_known(row.sd(state) for row in rows) for state in ("roll", "pitch", "yaw")]
+        tilt = {
+            "roll_rad": _known(row.roll_rad for row in rows),
+            "pitch_rad": _known(row.pitch_rad for row in rows),
+            "attitude_sd_rad": np.column_stack(sds),
+        }
     return TrackColumns(
         time_s=np.array([row.time_s for row in rows]),
         position_m=np.array([row.position_m for row in rows]),
         velocity_mps=np.array([row.velocity_mps for row in rows]),
-        yaw_rad=np.array([np.nan if row.yaw_rad is None else row.yaw_rad for row in rows]),
+        yaw_rad=_known(row.yaw_rad for row in rows),
         covariance_m2=covariance,
+        **tilt,
     )
+
+
+def _known(values: Iterable[float | None]) -> Floats:
+    return np.array([np.nan if value is None else value for value in values], float)

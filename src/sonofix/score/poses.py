@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.attitude import turned
 from sonofix.records import Floats, Truth
 from sonofix.site import Beacon, Microphone
 
@@ -24,6 +25,13 @@ def pose_at(truth: Truth, time_s: Floats) -> tuple[Floats, Floats]:
     return rows[:, :3], rows[:, 3]
 
 
+def tilt_at(truth: Truth, time_s: Floats) -> tuple[Floats, Floats]:
+    """Return true roll and pitch (n,), interpolated as `pose_at` does; 0 where they are not known: upright."""
+    known = (np.zeros(len(truth.time_s)) if angle is None else angle for angle in (truth.roll_rad, truth.pitch_rad))
+    roll, pitch = (np.interp(time_s, truth.time_s, angle) for angle in known)
+    return roll, pitch
+
+
 def within(truth: Truth, time_s: Floats) -> NDArray[np.bool_]:
     """Return whether each time lies in the truth's span; always, where the truth is one row."""
     if len(truth.time_s) == 1:
@@ -34,7 +42,7 @@ def within(truth: Truth, time_s: Floats) -> NDArray[np.bool_]:
 def node_position_m(node: Beacon | Microphone, truths: Mapping[str, Truth], time_s: Floats) -> Floats:
     """Return where a beacon or microphone is at the given times, shape (n, 3).
 
-    The lever arm (forward, left, up) is turned with its vehicle's heading.
+    The lever arm (forward, left, up) is turned with its vehicle.
 
     Raises
     ------
@@ -47,11 +55,7 @@ def node_position_m(node: Beacon | Microphone, truths: Mapping[str, Truth], time
         known = ", ".join(truths) or "none"
         raise ValueError(f"{node.id} rides on {node.vehicle}, of which there is no truth; there is of: {known}")
     position, yaw = pose_at(truths[node.vehicle], time_s)
-    forward, left, up = node.lever_arm_m
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return position + np.column_stack(
-        [cos * forward - sin * left, sin * forward + cos * left, np.full(len(time_s), up)]
-    )
+    return position + turned(node.lever_arm_m, *tilt_at(truths[node.vehicle], time_s), yaw)
 
 
 def heard_range_m(

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonofix.records import Floats, Truth
 from sonofix.score.columns import TrackColumns
-from sonofix.score.poses import pose_at, within
+from sonofix.score.poses import pose_at, tilt_at, within
 from sonofix.score.ranges import rms
 
 _VELOCITY_STEP_S = 0.01
@@ -20,7 +21,9 @@ class TrackFigures:
 
     ``inside_2sd`` is the share of rows with both x and y within two standard deviations (0.911 where these are right
     and x and y independent); ``nees_xy`` the mean normalised squared error of x and y (2 where the covariances are
-    right; Bar-Shalom, Li and Kirubarajan 2001, section 5.4). ``longest_gap_s`` counts the truth's ends as rows.
+    right; Bar-Shalom, Li and Kirubarajan 2001, section 5.4). ``longest_gap_s`` counts the truth's ends as rows. Roll
+    and pitch are judged where both truth and track have them, with ``nees_attitude``, of roll, pitch and yaw by their
+    deviations alone (3 where these are right).
     """
 
     rows: int
@@ -34,6 +37,9 @@ class TrackFigures:
     inside_2sd: float | None
     nees_xy: float | None
     longest_gap_s: float
+    rmse_roll_rad: float | None = None
+    rmse_pitch_rad: float | None = None
+    nees_attitude: float | None = None
 
 
 def score_track(truth: Truth, track: TrackColumns) -> TrackFigures | None:
@@ -63,7 +69,26 @@ def score_track(truth: Truth, track: TrackColumns) -> TrackFigures | None:
         inside_2sd=_inside(error, sd),
         nees_xy=_nees(error[:, :2], track.covariance_m2[keep][:, :2, :2]),
         longest_gap_s=_longest_gap_s(truth, time) if moving else 0.0,
+        **_attitude(truth, time, track, keep),
     )
+
+
+def _attitude(truth: Truth, time_s: Floats, track: TrackColumns, keep: NDArray[np.bool_]) -> dict[str, float | None]:
+    """Figures of roll and pitch; none where truth or track has none."""
+    if truth.roll_rad is None or truth.pitch_rad is None or truth.yaw_rad is None:
+        return {}
+    if track.roll_rad is None or track.pitch_rad is None or track.attitude_sd_rad is None:
+        return {}
+    told = np.column_stack([track.roll_rad, track.pitch_rad, track.yaw_rad])[keep]
+    true = np.column_stack([*tilt_at(truth, time_s), pose_at(truth, time_s)[1]])
+    wrong = np.angle(np.exp(1j * (told - true)))
+    weighted = np.sum((wrong / track.attitude_sd_rad[keep]) ** 2, axis=1)
+    known = np.isfinite(weighted)
+    return {
+        "rmse_roll_rad": rms(wrong[:, 0]),
+        "rmse_pitch_rad": rms(wrong[:, 1]),
+        "nees_attitude": float(np.mean(weighted[known])) if known.any() else None,
+    }
 
 
 def _velocity_rms_mps(truth: Truth, time_s: Floats, velocity_mps: Floats) -> float | None:

@@ -8,15 +8,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE, from_arm, open_arms
+from sonofix.geometry import PITCH, POSE, ROLL, SIZE, YAW, from_arm, open_arms, tilting
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
 from sonofix.track import steps, wheels
 from sonofix.track.anchor import lift
 from sonofix.track.inputs import STEP, WHEELS, Inputs
-
-SIZE = len(POSE)
+from sonofix.track.tilt import open_tilt, rock
 
 SOUND_SPEED_MPS = 343.0
 """Near enough to turn a clock's speed into m/s."""
@@ -33,13 +32,15 @@ class Motion:
     """How freely vehicles move: constant velocity, disturbed by white acceleration.
 
     ``acceleration_psd`` in m²/s³ per horizontal axis, ``climb_psd`` upwards (vehicles keep to floors), ``turn_psd`` in
-    rad²/s³, ``clock_psd`` in m²/s³ of the clock's drift.
+    rad²/s³, ``clock_psd`` in m²/s³ of the clock's drift. Roll and pitch of a body that tilts come back upright at
+    ``tilt_pace_radps``, the natural frequency of `tilt.rock`.
     """
 
     acceleration_psd: float = 0.5
     climb_psd: float = 0.01
     turn_psd: float = 0.3
     clock_psd: float = 1e-6
+    tilt_pace_radps: float = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +62,11 @@ class Belief:
     Attributes
     ----------
     time_s : float
-    mean : float64 (8 V + E + 2,)
+    mean : float64 (SIZE V + E + 2,)
         Each vehicle's `geometry.POSE`, the E states that ``inputs`` add, then clock offset (m) and drift (m/s).
-    covariance : float64 (8 V + E + 2, 8 V + E + 2)
+    covariance : float64 (SIZE V + E + 2, SIZE V + E + 2)
         Zero rows where a component is known or not estimated.
-    free : bool (8 V + E + 2,)
+    free : bool (SIZE V + E + 2,)
         What is estimated.
     placed : bool (V,)
         Vehicles that have a position yet.
@@ -73,6 +74,8 @@ class Belief:
         What the vehicles' own sensors tell, past and to come; only what is past enters.
     about : Nominal or None
         Where measurements are linearised; None: at ``mean``.
+    tilt_sd_rad : float64 (V,) or None
+        How far each vehicle tilts (`geometry.tilting`); None: all stand upright.
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -84,9 +87,14 @@ class Belief:
     placed: NDArray[np.bool_]
     inputs: Inputs | None = None
     about: Nominal | None = None
+    tilt_sd_rad: Floats | None = None
+
+    def tilts(self, vehicle: int) -> float:
+        """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
+        return 0.0 if self.tilt_sd_rad is None else float(self.tilt_sd_rad[vehicle])
 
     def pose(self) -> Floats:
-        """Poses (V, 8)."""
+        """Poses (V, SIZE)."""
         return self.mean[: SIZE * len(self.placed)].reshape(-1, SIZE)
 
     def near(self, nominal: Floats, mean: Floats) -> Floats:
@@ -119,7 +127,7 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
             for i, sd in ((0, RANGE_SCALE_SD), (1, RANGE_BIAS_SD_M)):
                 covariance[inputs.range_slot + i, inputs.range_slot + i] = sd**2
                 free[inputs.range_slot + i] = True
-    return Belief(0.0, mean, covariance, free, np.zeros(len(site.vehicles), bool), inputs)
+    return Belief(0.0, mean, covariance, free, np.zeros(len(site.vehicles), bool), inputs, tilting(site))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -166,11 +174,13 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     inputs, now_s = belief.inputs, belief.time_s
     if inputs is None:
         age(mean, covariance, free, belief.placed, densities, float(dt))
+        _rock(belief, mean, covariance, motion, float(dt))
         return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
     free = free.copy()
     for row in (*told, None):
         until_s = time_s if row is None else float(inputs.time_s[row])
         age(mean, covariance, free, belief.placed, densities, until_s - now_s)
+        _rock(belief, mean, covariance, motion, until_s - now_s)
         for vehicle, (step, wheel) in enumerate(
             zip(inputs.step_slot.tolist(), inputs.wheel_slot.tolist(), strict=True)
         ):
@@ -183,6 +193,13 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
             _sense(mean, covariance, free, inputs, row, about)
         now_s = until_s
     return replace(belief, time_s=time_s, mean=mean, covariance=covariance, free=free)
+
+
+def _rock(belief: Belief, mean: Floats, covariance: Floats, motion: Motion, dt: float) -> None:
+    """Age roll and pitch of all vehicles that tilt, in place."""
+    for vehicle in range(len(belief.placed)):
+        if belief.free[SIZE * vehicle + ROLL]:
+            rock(mean, covariance, vehicle, belief.tilts(vehicle), motion.tilt_pace_radps, dt)
 
 
 def _sense(
@@ -200,11 +217,11 @@ def _sense(
         wheels.point(mean, covariance, free, vehicle, first)
 
 
-def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
+def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: float = 2.0) -> Belief:
     """Put a vehicle where a fix says, forgetting what was believed of it.
 
     ``arm`` (2,) is its `geometry.open_arms`: the motion is followed there. Velocities that the fix leaves open start
-    at 0 ± 1 m/s.
+    at 0 ± 1 m/s, and how fast a body that tilts rocks at what ``tilt_pace_radps`` of `Motion` makes of its tilt.
     """
     if fix.position_m is None or fix.covariance is None:
         raise ValueError(f"a fix of status {fix.status!r} has no position to place vehicle {fix.vehicle} at")
@@ -219,7 +236,8 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
     mean[at : at + 3] = fix.position_m - np.append(shift, 0.0)
     if fix.velocity_mps is not None:
         mean[at + 4 : at + 7] = fix.velocity_mps
-    mean[at + 3] = fix.yaw_rad or 0.0
+    mean[at + YAW] = fix.yaw_rad or 0.0
+    mean[at + ROLL], mean[at + PITCH] = fix.roll_rad or 0.0, fix.pitch_rad or 0.0
     if "clock" in fix.states:
         names["clock"] = len(mean) - 2
         clock = [len(mean) - 2, len(mean) - 1]
@@ -237,13 +255,21 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> Belief:
         if free[at + open_by] and not free[at + i]:
             free[at + i] = True
             covariance[at + i, at + i] = 1.0
+    if free[at + YAW] and belief.tilts(vehicle):
+        open_tilt(covariance, free, vehicle, belief.tilts(vehicle), tilt_pace_radps)
     placed = belief.placed.copy()
     placed[vehicle] = True
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
 
 
 def start_at(
-    belief: Belief, vehicle: int, position_m: Floats, yaw_rad: float, level_known: bool, turns: bool
+    belief: Belief,
+    vehicle: int,
+    position_m: Floats,
+    yaw_rad: float,
+    level_known: bool,
+    turns: bool,
+    tilt_pace_radps: float = 2.0,
 ) -> Belief:
     """Put a vehicle at a stated start pose, good to 5 cm and 0.1 rad, at rest as far as is known (0 ± 0.5 m/s).
 
@@ -258,6 +284,8 @@ def start_at(
             continue
         free[at + i] = True
         covariance[at + i, at + i] = sd**2
+    if turns and belief.tilts(vehicle):
+        open_tilt(covariance, free, vehicle, belief.tilts(vehicle), tilt_pace_radps)
     placed = belief.placed.copy()
     placed[vehicle] = True
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
@@ -278,7 +306,7 @@ def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estima
     """Return what is believed of one vehicle."""
     at, n = SIZE * vehicle, len(belief.mean)
     free = belief.free.tolist()
-    own = [at + i for i, name in enumerate(POSE) if free[at + i] and name != "yaw_rate"]
+    own = [at + i for i, name in enumerate(POSE) if free[at + i] and not name.endswith("_rate")]
     names = [POSE[i - at] for i in own]
     if free[n - 2]:
         own.append(n - 2)
@@ -297,8 +325,15 @@ def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estima
         states=tuple(names),
         position_m=position,
         velocity_mps=pose[4:7].copy(),
-        yaw_rad=float(np.angle(np.exp(1j * pose[3]))) if free[at + 3] else None,
+        yaw_rad=_angle(pose[YAW]) if free[at + YAW] else None,
         clock_offset_m=float(belief.mean[n - 2]) if free[n - 2] else None,
         covariance=covariance,
         source=source,
+        roll_rad=_angle(pose[ROLL]) if free[at + ROLL] else None,
+        pitch_rad=_angle(pose[PITCH]) if free[at + PITCH] else None,
     )
+
+
+def _angle(angle_rad: float) -> float:
+    """Return the same angle between −π and π."""
+    return float(np.angle(np.exp(1j * angle_rad)))

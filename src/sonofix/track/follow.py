@@ -71,7 +71,9 @@ class Follower:
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         x, y = self._arms[who]
         position_m = position_m + np.array([cos * x - sin * y, sin * x + cos * y, 0.0])
-        self.belief = start_at(replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns)
+        self.belief = start_at(
+            replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns, self.motion.tilt_pace_radps
+        )
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -213,7 +215,9 @@ class Follower:
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
-            self.belief = predict(place(aged, who, start, self._arms[who]), self.belief.time_s, self.motion)
+            self.belief = predict(
+                place(aged, who, start, self._arms[who], self.motion.tilt_pace_radps), self.belief.time_s, self.motion
+            )
             self._refused[who], self._heard[who] = 0, True
             taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import open_arms
+from sonofix.geometry import SIZE, open_arms
 from sonofix.records import Floats, Table
 from sonofix.site import Site
 from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
@@ -108,9 +108,9 @@ def gather(site: Site, tables: Mapping[str, Table], stated: bool = False) -> Inp
     size, slots = 0, np.full((2, len(ids)), -1, np.int64)
     for kind, states in ((STEP, STEP_STATES), (WHEELS, WHEEL_STATES)):
         for i in np.unique(vehicle[kinds == kind]).tolist():
-            slots[kind, i] = 8 * len(ids) + size
+            slots[kind, i] = SIZE * len(ids) + size
             size += len(states)
-    range_slot = 8 * len(ids) + size if stated else -1
+    range_slot = SIZE * len(ids) + size if stated else -1
     size += len(RANGE_STATES) if stated else 0
     headed = np.array([bool(np.any((vehicle == i) & (kinds != STEP))) for i in range(len(ids))])
     return Inputs(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE
+from sonofix.geometry import SIZE
 from sonofix.records import Floats
 from sonofix.track.anchor import correct, stir
 
@@ -53,7 +53,7 @@ def wander(mean: Floats, covariance: Floats, vehicle: int, slot: int, dt: float,
         covariance[i, i] += sd**2 * (1.0 - fade**2)
     if not placed:
         return
-    for at in (len(POSE) * vehicle, len(POSE) * vehicle + 1):
+    for at in (SIZE * vehicle, SIZE * vehicle + 1):
         stir(covariance, at, AGILE_PSD, dt)
 
 
@@ -76,7 +76,7 @@ def take(
         about = mean if about is None else about
         miss, derivative, noise = measure(about, vehicle, slot, length_m, heading_rad)
         correct(mean, covariance, miss - derivative @ (mean - about), derivative, noise, UNLIKELY)
-    at = len(POSE) * vehicle
+    at = SIZE * vehicle
     mean[slot : slot + 2] = mean[at : at + 2]
     covariance[slot : slot + 2, :] = covariance[at : at + 2, :]
     covariance[:, slot : slot + 2] = covariance[:, at : at + 2]
@@ -90,7 +90,7 @@ def measure(
 
     With a the anchor and k and ψ the errors of length and heading, p − a = (1 − k) L u(h − ψ).
     """
-    at = len(POSE) * vehicle
+    at = SIZE * vehicle
     length = length_m * (1.0 - about[slot + 2])
     cos, sin = np.cos(heading_rad - about[slot + 3]), np.sin(heading_rad - about[slot + 3])
     along, across = np.array([cos, sin]), np.array([-sin, cos])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import POSE
+from sonofix.geometry import SIZE
 from sonofix.records import Floats
 from sonofix.track.anchor import correct, stir
 
@@ -75,7 +75,7 @@ def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int,
     span = abs(dt)
     covariance[slot + 3, slot + 3] += SCALE_PSD * span
     covariance[slot + 4, slot + 4] += BIAS_PSD * span
-    at = len(POSE) * vehicle + 3
+    at = SIZE * vehicle + 3
     if free[at]:
         stir(covariance, at, AGILE_TURN_PSD, dt)
 
@@ -95,7 +95,7 @@ def take(
     ``arc`` is way, turn, time, and what it may have turned unseen at their end; ``arm`` (2,) is where the motion is
     followed, from the vehicle's origin. The arc is linearised at ``about``, or else at the mean.
     """
-    at = len(POSE) * vehicle
+    at = SIZE * vehicle
     way, turn, dt, unseen = arc
     if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and dt <= LONGEST_S:
         about = mean if about is None else about
@@ -119,7 +119,7 @@ def measure(
     With a and α the anchor's place and heading, k and b the errors of way and yaw rate, and ω = turn − b dt: ψ = α + ω,
     p − a = (1 − k) way sinc(ω/2) u(α + ω/2) + (R(ψ) − R(α)) arm.
     """
-    at = len(POSE) * vehicle
+    at = SIZE * vehicle
     way, turn, dt = arc
     before, now = about[slot + 2], about[at + 3]
     turned = turn - about[slot + 4] * dt
@@ -151,7 +151,7 @@ def measure(
 
 def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, heading_rad: float) -> None:
     """Correct a heading by a compass reading, in place; the first reading gives the heading."""
-    at = len(POSE) * vehicle + 3
+    at = SIZE * vehicle + 3
     if not np.isfinite(heading_rad):
         return
     if not free[at]:
@@ -170,7 +170,7 @@ def open_heading(
 ) -> None:
     """Begin to follow a heading, in place; how fast it turns starts at 0 ± 1 rad/s."""
     for i, value, sd in ((3, yaw_rad, sd_rad), (7, 0.0, 1.0)):
-        at = len(POSE) * vehicle + i
+        at = SIZE * vehicle + i
         mean[at] = value
         covariance[at, :] = covariance[:, at] = 0.0
         covariance[at, at] = sd**2
