@@ -67,7 +67,8 @@ def write_track(out: str | Path, steps: Iterable[Step], site: Site) -> None:
 
         write_whole(Path(out) / name, make)
 
-    write("track.csv", COLUMNS["track.csv"].split(","), ",", [(e.time_s, _track_row(e)) for e in found])
+    tilts = _tilts(site)
+    write("track.csv", _header("track.csv", tilts), ",", [(e.time_s, _track_row(e, tilts)) for e in found])
     for vehicle in site.vehicles:
         rows = [(e.time_s, _tum_row(e)) for e in found if e.vehicle == vehicle.id]
         write(_tum_name(site, vehicle.id), None, " ", rows)
@@ -101,9 +102,7 @@ class RunWriter:
         }
         self._files: dict[str, _RowFile] = {}
         self._last_sync_s: float | None = None
-        from sonofix.geometry import tilting
-
-        self._tilts = bool(tilting(site).any())
+        self._tilts = _tilts(site)
 
     def __enter__(self) -> Self:
         """Make the folder and its files, with their first lines."""
@@ -115,10 +114,8 @@ class RunWriter:
         with told(self.out, ""):
             self.out.mkdir(parents=True, exist_ok=True)
         try:
-            for name, header in COLUMNS.items():
-                if self._tilts and name in ("fixes.csv", "track.csv"):
-                    header = f"{header},{TILT_COLUMNS}"
-                self._files[name] = _RowFile(self.out / name, header.split(","), ",")
+            for name in COLUMNS:
+                self._files[name] = _RowFile(self.out / name, _header(name, self._tilts), ",")
             for vehicle in self._site.vehicles:
                 self._files[f"tum {vehicle.id}"] = _RowFile(self.out / _tum_name(self._site, vehicle.id), None, " ")
         except BaseException:
@@ -151,7 +148,9 @@ class RunWriter:
         sync_s = step.ranges.sync_s
         self._files["ranges.csv"].add(_range_rows(step))
         self._files["fixes.csv"].add((fix.time_s, self._fix_row(fix, step.ranges)) for fix in step.fixes)
-        self._files["track.csv"].add((estimate.time_s, self._track_row(estimate)) for estimate in step.estimates)
+        self._files["track.csv"].add(
+            (estimate.time_s, _track_row(estimate, self._tilts)) for estimate in step.estimates
+        )
         self._files["events.csv"].add((event.time_s, _event_row(event)) for event in step.events)
         for estimate in step.estimates:
             key = f"tum {estimate.vehicle}"
@@ -179,26 +178,8 @@ class RunWriter:
             *(_figure(_covariance(fix, a, b)) for a, b in ("xx", "xy", "yy", "zz")),
             *(_figure(value) for value in (fix.hdop, fix.vdop, fix.hpl_m, fix.vpl_m)),
             *map(str, (int(np.count_nonzero(heard)), used, excluded)),
-            *self._tilt(fix),
+            *(_tilt(fix) if self._tilts else ()),
         ]
-
-    def _track_row(self, estimate: Estimate) -> list[str]:
-        return [
-            _time(estimate.time_s),
-            estimate.vehicle,
-            *(_length(value) for value in estimate.position_m),
-            *(_length(value) for value in estimate.velocity_mps),
-            _angle(estimate.yaw_rad),
-            *(_figure(estimate.sd(state)) for state in ("x", "y", "z", "yaw")),
-            estimate.source,
-            *self._tilt(estimate),
-        ]
-
-    def _tilt(self, of: Fix | Estimate) -> list[str]:
-        """Cells of `TILT_COLUMNS`, where the site has them."""
-        if not self._tilts:
-            return []
-        return [_angle(of.roll_rad), _angle(of.pitch_rad), *(_figure(of.sd(state)) for state in ("roll", "pitch"))]
 
     def _concerns(self, vehicle: str, ranges: RangeEpoch) -> NDArray[np.bool_]:
         """Say of each row whether one of its ends rides on the vehicle."""
@@ -209,6 +190,37 @@ class RunWriter:
     def _abandon(self) -> None:
         for file in self._files.values():
             file.abandon()
+
+
+def _tilts(site: Site) -> bool:
+    """Whether a vehicle of the site tilts."""
+    from sonofix.geometry import tilting
+
+    return bool(tilting(site).any())
+
+
+def _header(name: str, tilts: bool) -> list[str]:
+    """Names of a file's columns."""
+    behind = f",{TILT_COLUMNS}" if tilts and name in ("fixes.csv", "track.csv") else ""
+    return f"{COLUMNS[name]}{behind}".split(",")
+
+
+def _track_row(estimate: Estimate, tilts: bool) -> list[str]:
+    return [
+        _time(estimate.time_s),
+        estimate.vehicle,
+        *(_length(value) for value in estimate.position_m),
+        *(_length(value) for value in estimate.velocity_mps),
+        _angle(estimate.yaw_rad),
+        *(_figure(estimate.sd(state)) for state in ("x", "y", "z", "yaw")),
+        estimate.source,
+        *(_tilt(estimate) if tilts else ()),
+    ]
+
+
+def _tilt(of: Fix | Estimate) -> list[str]:
+    """Cells of `TILT_COLUMNS`."""
+    return [_angle(of.roll_rad), _angle(of.pitch_rad), *(_figure(of.sd(state)) for state in ("roll", "pitch"))]
 
 
 class _RowFile:

@@ -127,7 +127,8 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
             for i, sd in ((0, RANGE_SCALE_SD), (1, RANGE_BIAS_SD_M)):
                 covariance[inputs.range_slot + i, inputs.range_slot + i] = sd**2
                 free[inputs.range_slot + i] = True
-    return Belief(0.0, mean, covariance, free, np.zeros(len(site.vehicles), bool), inputs, tilting(site))
+    placed = np.zeros(len(site.vehicles), bool)
+    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site))
 
 
 @numba.njit(cache=True, error_model="numpy")
