@@ -66,7 +66,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
         yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
     elif recording.ranges is not None:
         street = Street(recording.site, recording.tables.get("start"), rate_hz)
-        street.sense(recording.tables, stated=True)
+        street.sense(recording.tables, tuple(zip(recording.ranges.emitter, recording.ranges.receiver, strict=True)))
         for epoch in stated_epochs(recording.ranges, recording.site):
             yield street.walk(epoch)
     else:
@@ -170,10 +170,10 @@ class Street:
         self._start = start
         self._written_s: float | None = None
 
-    def sense(self, tables: Mapping[str, Table], stated: bool = False) -> None:
+    def sense(self, tables: Mapping[str, Table], stated: tuple[tuple[str, str], ...] | None = None) -> None:
         """Let what vehicles' own sensors tell of their motion enter, each row at its time; before the first epoch.
 
-        ``stated``: the ranges come from others, with errors of their own.
+        ``stated``: pairs (emitter, receiver) whose ranges come from others, with errors of their own.
         """
         inputs = gather(self.site, tables, stated)
         self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs)

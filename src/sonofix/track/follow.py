@@ -12,9 +12,10 @@ from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
-from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, reopen, start_at
+from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
+from sonofix.track.rival import ASKED_S, Rival, beside
 from sonofix.track.update import strangeness, update
 
 PATIENCE = 3
@@ -23,9 +24,6 @@ PATIENCE = 3
 CONTRADICTED = 30.0
 """Squared distance of a fix from the track, over its expected value per axis, at which the fix is followed at once:
 noise alone comes there once in three million epochs."""
-
-DOUBT_RATE = 0.05
-"""How fast the variance of stated ranges is scaled, per range."""
 
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
@@ -59,7 +57,8 @@ class Follower:
         self._heard = np.zeros(len(site.vehicles), bool)
         self._recent: list[RangeEpoch] = []
         self._lag_s = 0.0
-        self._doubt = 1.0
+        self._rival: Rival | None = None
+        self._looked_s = -np.inf
         self._course = Course()
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
@@ -95,16 +94,13 @@ class Follower:
         self._clock(epoch, fixes)
         self._gather(epoch)
         taken = self._place(links, fixes, events)
-        stated = epoch.snr_db is None
-        asked = replace(epoch, covariance_m2=self._doubt * epoch.covariance_m2) if stated else epoch
         # ranges that placed a vehicle have had their say
         before = self.belief
-        self.belief, used, surprise = update(before, asked, links, candidates & ~taken)
-        if before.inputs is not None:
-            used = self._slipped(before, asked, links, candidates & ~taken, used, events)
+        self.belief, used, _ = update(before, epoch, links, candidates & ~taken)
+        if before.inputs is not None and len(before.inputs.time_s):
+            used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
         used |= taken
-        if stated:
-            self._learn(surprise)
+        used = self._contest(epoch, links, candidates, used, events)
         self.belief = self._course.head(self.belief)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
@@ -172,14 +168,37 @@ class Follower:
         free[-2:] = True
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
 
-    def _learn(self, surprise: Floats) -> None:
-        """Scale the variance that stated ranges claim until their innovations agree with it.
+    def _contest(
+        self,
+        epoch: RangeEpoch,
+        links: Links,
+        asked: NDArray[np.bool_],
+        used: NDArray[np.bool_],
+        events: list[Event],
+    ) -> NDArray[np.bool_]:
+        """Where ranges are stated by others, follow a second place beside the track as long as either may be true.
 
-        Ranges stated by others come with rough deviations or none, and with errors that no deviation tells of.
+        Returns the rows used.
         """
-        for value in surprise:
-            self._doubt *= float(np.exp(DOUBT_RATE * (min(value, 9.0) - 1.0)))
-        self._doubt = float(np.clip(self._doubt, 1.0, 1e4))
+        trust, rival = self.belief.trust, self._rival
+        if trust is None or not len(epoch):
+            return used
+        if rival is not None:
+            rival = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
+            self._rival = None if rival.lost or rival.won else rival
+            if rival.won:
+                self.belief = rival.belief
+                self._refused[rival.vehicle] = 0
+                x, y, z = estimate(self.belief, self.site, rival.vehicle, "fused").position_m
+                text = f"another place is likelier by far: ({x:.3f}, {y:.3f}, {z:.3f}) m"
+                events.append(Event(self.belief.time_s, self.site.vehicles[rival.vehicle].id, "reset", text))
+                return asked.copy()
+        elif self.belief.time_s - self._looked_s >= ASKED_S:
+            self._looked_s = self.belief.time_s
+            for who in np.flatnonzero(self.belief.placed).tolist():
+                if self._rival is None and np.any(self._touches(links, who)):
+                    self._rival = beside(self.belief, who, self._gathered(self.site.vehicles[who].id), self._arms[who])
+        return used
 
     @property
     def _corrected(self) -> bool:
@@ -207,7 +226,10 @@ class Follower:
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
             self.belief = predict(place(aged, who, start, self._arms[who]), self.belief.time_s, self.motion)
             self._refused[who], self._heard[who] = 0, True
-            taken |= start.used if start is found else self._touches(links, who)
+            if self._corrected:
+                self.belief = loosen(self.belief, who)
+            else:
+                taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
             events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))

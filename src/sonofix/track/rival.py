@@ -1,0 +1,81 @@
+"""A second place that ranges might as well put a vehicle, followed beside the track until one of the two is likelier.
+
+Ranges stated by others state deviations that are worth little: a track that began in the wrong valley learns to take
+its misfit for noise, and no gate notices. Its likelihood does: noise that is learnt to be large makes every epoch
+unlikely. So where a fix of the latest ranges is far from the track, a track from there runs along, with errors and
+noise of its own to learn, and the logarithms of what the two expected of each epoch are summed (Bayes factor; a
+sequential test, Wald 1945).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.geometry import Links
+from sonofix.records import Fix, Floats, RangeEpoch
+from sonofix.track import stated
+from sonofix.track.belief import SIZE, Belief, Motion, loosen, place, predict
+from sonofix.track.update import update
+
+DECIDED = 10.0
+"""Difference of log likelihoods at which one of two tracks is dropped: odds of e¹⁰."""
+
+FAR = 20.0
+"""Squared distance, over its variance, of a fix that is worth a rival."""
+
+ASKED_S = 5.0
+"""How often a fix of the latest ranges is looked at."""
+
+TRIED_S = 30.0
+"""A rival that has not won by then is dropped."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rival:
+    """A track beside the track: what it believes, and by how much it was likelier since it began at ``since_s``."""
+
+    belief: Belief
+    vehicle: int
+    since_s: float
+    ahead: float = 0.0
+
+    def take(
+        self, time_s: float, motion: Motion, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], others: float
+    ) -> Rival:
+        """Follow an epoch of which the track made the log likelihood ``others``."""
+        belief, _, _ = update(predict(self.belief, max(time_s, self.belief.time_s), motion), epoch, links, asked)
+        trust = belief.trust
+        own = 0.0 if trust is None else trust.told
+        return replace(self, belief=belief, ahead=self.ahead + own - others)
+
+    @property
+    def won(self) -> bool:
+        """Whether it is likelier beyond doubt."""
+        return self.ahead > DECIDED
+
+    @property
+    def lost(self) -> bool:
+        """Whether it is less likely beyond doubt, or has had its time."""
+        return self.ahead < -DECIDED or self.belief.time_s - self.since_s > TRIED_S
+
+
+def beside(belief: Belief, vehicle: int, found: Fix, arm: Floats) -> Rival | None:
+    """Begin a rival where a fix puts a vehicle, if that is far from the track; None where it is not.
+
+    What ranges err by is to be learnt anew; noise begins as large as the track has it.
+    """
+    if belief.inputs is None or belief.trust is None or found.position_m is None or found.covariance is None:
+        return None
+    own = slice(SIZE * vehicle, SIZE * vehicle + 2)
+    apart = found.position_m[:2] - belief.mean[own]
+    allowed = belief.covariance[own, own] + found.covariance[:2, :2] + stated.BIAS_SD_M**2 * np.eye(2)
+    if apart @ np.linalg.solve(allowed, apart) < FAR:
+        return None
+    begun = loosen(place(belief, vehicle, found, arm), vehicle)
+    mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
+    stated.begin(mean, covariance, free, belief.inputs.range_slot, len(belief.inputs.pairs))
+    begun = replace(begun, mean=mean, covariance=covariance, free=free, trust=belief.trust.anew())
+    return Rival(begun, vehicle, belief.time_s)
