@@ -15,7 +15,7 @@ from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
-from sonofix.track.rival import ASKED_S, Rival, beside
+from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, image
 from sonofix.track.update import strangeness, update
 
 PATIENCE = 3
@@ -59,6 +59,8 @@ class Follower:
         self._lag_s = 0.0
         self._rival: Rival | None = None
         self._looked_s = -np.inf
+        self._begun_s = np.full(len(site.vehicles), -np.inf)
+        self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
@@ -181,11 +183,12 @@ class Follower:
         Returns the rows used.
         """
         trust, rival = self.belief.trust, self._rival
-        if trust is None or not len(epoch):
+        if trust is None or not len(epoch) or not self.belief.placed.any():
             return used
         if rival is not None:
             rival = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
             self._rival = None if rival.lost or rival.won else rival
+            self._undecided[rival.vehicle] &= self._rival is not None
             if rival.won:
                 self.belief = rival.belief
                 self._refused[rival.vehicle] = 0
@@ -197,7 +200,12 @@ class Follower:
             self._looked_s = self.belief.time_s
             for who in np.flatnonzero(self.belief.placed).tolist():
                 if self._rival is None and np.any(self._touches(links, who)):
-                    self._rival = beside(self.belief, who, self._gathered(self.site.vehicles[who].id), self._arms[who])
+                    found = self._gathered(self.site.vehicles[who].id)
+                    young = self.belief.time_s - self._begun_s[who] < TRIED_S
+                    for other in (found, image(self.belief, who, links, found))[: 1 + young]:
+                        self._rival = self._rival or beside(self.belief, who, other, self._arms[who])
+                    if young and self._rival is not None and self._rival.vehicle == who:
+                        self._undecided[who] = True
         return used
 
     @property
@@ -228,6 +236,7 @@ class Follower:
             self._refused[who], self._heard[who] = 0, True
             if self._corrected:
                 self.belief = loosen(self.belief, who)
+                self._begun_s[who] = self.belief.time_s
             else:
                 taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m
@@ -308,7 +317,7 @@ class Follower:
 
     def _estimates(self, links: Links, used: NDArray[np.bool_]) -> tuple[Estimate, ...]:
         out = []
-        for who in np.flatnonzero(self.belief.placed):
+        for who in np.flatnonzero(self.belief.placed & ~self._undecided):
             entered = bool((used & self._touches(links, int(who))).any())
             out.append(estimate(self.belief, self.site, int(who), "fused" if entered else "predicted"))
         return tuple(out)

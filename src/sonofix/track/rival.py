@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import Links
+from sonofix.locate.search import mirror
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.track import stated
 from sonofix.track.belief import SIZE, Belief, Motion, loosen, place, predict
@@ -28,6 +29,9 @@ FAR = 20.0
 
 ASKED_S = 5.0
 """How often a fix of the latest ranges is looked at."""
+
+HEARD = 30
+"""Ranges before which likelihoods are not compared: how large noise is must be known first."""
 
 TRIED_S = 30.0
 """A rival that has not won by then is dropped."""
@@ -48,8 +52,9 @@ class Rival:
         """Follow an epoch of which the track made the log likelihood ``others``."""
         belief, _, _ = update(predict(self.belief, max(time_s, self.belief.time_s), motion), epoch, links, asked)
         trust = belief.trust
-        own = 0.0 if trust is None else trust.told
-        return replace(self, belief=belief, ahead=self.ahead + own - others)
+        if trust is None or trust.count[-1] < HEARD:
+            return replace(self, belief=belief)
+        return replace(self, belief=belief, ahead=self.ahead + trust.told - others)
 
     @property
     def won(self) -> bool:
@@ -60,6 +65,27 @@ class Rival:
     def lost(self) -> bool:
         """Whether it is less likely beyond doubt, or has had its time."""
         return self.ahead < -DECIDED or self.belief.time_s - self.since_s > TRIED_S
+
+
+def image(belief: Belief, vehicle: int, links: Links, like: Fix) -> Fix:
+    """Return a fix at the mirror image of a vehicle's place in the line that the fixed ends of rows are nearest to.
+
+    It has no position where they are not near a line, or where a heading or a height would have to be mirrored too.
+    """
+    at, listening = SIZE * vehicle, links.receiver_vehicle == vehicle
+    nowhere = replace(like, position_m=None)
+    if belief.free[at + 2] or belief.free[at + 3]:
+        return nowhere
+    ends = np.concatenate(
+        [
+            links.emitter_point[listening & (links.emitter_vehicle < 0)],
+            links.receiver_point[(links.emitter_vehicle == vehicle) & (links.receiver_vehicle < 0)],
+        ]
+    )
+    place_m = belief.mean[at : at + 3].copy()
+    if len(ends) < 2 or not mirror(place_m, ends, 2):
+        return nowhere
+    return replace(like, position_m=place_m, covariance=np.eye(2), states=("x", "y"), velocity_mps=None)
 
 
 def beside(belief: Belief, vehicle: int, found: Fix, arm: Floats) -> Rival | None:
