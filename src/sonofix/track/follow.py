@@ -281,6 +281,10 @@ class Follower:
         if self._corrected and self.belief.inputs is not None:
             scale, bias_m = self.belief.mean[self.belief.inputs.range_slot :][:2]
             merged = replace(merged, range_m=(merged.range_m - bias_m) / (1.0 + scale))
+            if self.belief.trust is not None:
+                numbers = np.array([self.belief.inputs.pairs[pair] for pair in latest])
+                own_m2 = self.belief.trust.extra(numbers) + self.belief.trust.variance[:, numbers].sum(axis=0)
+                merged = replace(merged, covariance_m2=merged.covariance_m2 + np.diag(own_m2))
         return fix(merged, self.site, vehicle)
 
     def _touches(self, links: Links, who: int) -> NDArray[np.bool_]:
