@@ -22,7 +22,7 @@ SIZE = len(POSE)
 SOUND_SPEED_MPS = 343.0
 """Near enough to turn a clock's speed into m/s."""
 
-LOOSE = 1.0
+LOOSE = 0.5
 """Deviation in m and rad with which a place is taken that ranges stated by others gave: they speak again at once."""
 
 INSTANT_S = 1e-9

@@ -25,6 +25,12 @@ CONTRADICTED = 30.0
 """Squared distance of a fix from the track, over its expected value per axis, at which the fix is followed at once:
 noise alone comes there once in three million epochs."""
 
+AGILITY_RATE = 0.05
+"""How fast the density of acceleration follows, per epoch."""
+
+AGILITY = (1e-3, 2.0)
+"""Least and most that it may become, in m²/s³."""
+
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
 
@@ -59,6 +65,7 @@ class Follower:
         self._lag_s = 0.0
         self._rival: Rival | None = None
         self._looked_s = -np.inf
+        self._pushed: Floats | None = None
         self._begun_s = np.full(len(site.vehicles), -np.inf)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
@@ -102,6 +109,7 @@ class Follower:
         if before.inputs is not None and len(before.inputs.time_s):
             used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
         used |= taken
+        self._loosen(before)
         used = self._contest(epoch, links, candidates, used, events)
         self.belief = self._course.head(self.belief)
         self._judge(epoch, links, used, fixes, events)
@@ -169,6 +177,24 @@ class Follower:
         covariance[-1, -1] = (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
         free[-2:] = True
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
+
+    def _loosen(self, before: Belief) -> None:
+        """Let vehicles be as agile as their track shows, where ranges are stated by others and nothing else tells.
+
+        Corrections of velocity that follow each other agree in direction where motion is taken as too calm, and
+        oppose each other where it is taken as too free (Mehra 1970: innovations of an optimal filter are white).
+        """
+        inputs = before.inputs
+        if before.trust is None or inputs is None or len(inputs.time_s) or not before.placed.any():
+            return
+        now = (self.belief.pose() - before.pose())[before.placed, 4:6].ravel()
+        last, self._pushed = self._pushed, now
+        size = float(np.linalg.norm(now))
+        if last is None or last.shape != now.shape or size * float(np.linalg.norm(last)) == 0.0:
+            return
+        agree = float(now @ last) / (size * float(np.linalg.norm(last)))
+        psd = self.motion.acceleration_psd * float(np.exp(AGILITY_RATE * agree))
+        self.motion = replace(self.motion, acceleration_psd=float(np.clip(psd, *AGILITY)))
 
     def _contest(
         self,
