@@ -25,7 +25,7 @@ CONTRADICTED = 30.0
 """Squared distance of a fix from the track, over its expected value per axis, at which the fix is followed at once:
 noise alone comes there once in three million epochs."""
 
-AGILITY_RATE = 0.05
+AGILITY_RATE = 0.1
 """How fast the density of acceleration follows, per epoch."""
 
 AGILITY = (1e-3, 2.0)

@@ -17,7 +17,7 @@ from sonofix.records import Floats
 SCALE_SD = 0.05
 """Of the share of the way by which all ranges are too long; it stays what it is."""
 
-BIAS_SD_M = 0.3
+BIAS_SD_M = 0.1
 """Of what all ranges are too long by; it stays what it is."""
 
 COMMON = 2
@@ -27,7 +27,7 @@ KINDS = 2
 """Errors of each pair: slow, quick."""
 
 BEGIN_SD_M = 0.1
-"""Of slow and quick errors, before ranges have told."""
+"""Of slow errors, of quick ones and of noise beyond what is stated, each, before ranges have told."""
 
 CORRELATED_S = np.array([3000.0, 2.0])
 """Of slow errors (antennas, walls) and of quick ones (multipath along the way)."""
@@ -79,11 +79,9 @@ class Trust:
 
     def extra(self, pair: NDArray[np.int64]) -> Floats:
         """Variance (n,) in m² that rows of some pairs have beyond what they state."""
-        n = max(float(self.count[-1]), 1e-9)
-        square, stated = self.square[-1] / n, self.stated[-1] / n
-        beyond = self.square[pair] - self.stated[pair] + POOL * (square - stated)
-        # a handful of ranges tells little of noise
-        return np.maximum(beyond / (self.count[pair] + POOL), 0.0) * min(1.0, n / POOL)
+        every = (self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
+        beyond = self.square[pair] - self.stated[pair] + POOL * every
+        return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
 
     def anew(self) -> Trust:
         """Return what another track may begin with: noise as large, soon forgotten; errors as before anything."""

@@ -111,13 +111,15 @@ def _learn(
     asked: tuple[Links, Floats, Floats, NDArray[np.int64]],
     claimed: Floats,
 ) -> Belief:
-    """Learn from what a corrected belief makes of all rows asked, refused ones as well; they claimed so much variance."""
+    """Learn from what a corrected belief makes of all rows asked, refused ones too; ``claimed`` (n,) in m²."""
     links, dt, measured, pair = asked
     slot = -1 if belief.inputs is None else belief.inputs.range_slot
     shown, derivative = _expected(links, belief, belief.mean, dt, epoch, pair)
     square = (measured - shown) ** 2 + np.einsum("ij,ij->i", derivative @ belief.covariance, derivative)
     at = stated.places(slot, pair, len(trust.count) - 1)
-    errors = belief.mean[at] ** 2 + belief.covariance[at, at]
+    apart = belief.mean[at]
+    apart[0] -= apart[0].mean()  # what all pairs share is the common bias's
+    errors = apart**2 + belief.covariance[at, at]
     return replace(belief, trust=trust.after(pair, square, claimed, errors))
 
 
