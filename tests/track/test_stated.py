@@ -22,7 +22,9 @@ def circle(time_s: float) -> tuple[float, float, float]:
     return 5.0 + 2.5 * np.sin(0.3 * time_s), 4.0 - 2.0 * np.cos(0.3 * time_s), 1.1
 
 
-def walked(errors_m: Floats, rng: np.random.Generator, claimed_m: float = SD_M) -> tuple[Street, Floats, Floats, Floats]:
+def walked(
+    errors_m: Floats, rng: np.random.Generator, claimed_m: float = SD_M
+) -> tuple[Street, Floats, Floats, Floats]:
     """Drive round and round with so much (epochs, pairs) added to ranges.
 
     Returns the street, misses (n, 3, 2) of the track, its deviations, and of each epoch's fix; NaN where there is none.

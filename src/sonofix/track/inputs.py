@@ -80,9 +80,7 @@ def reckoned(inputs: Inputs, vehicle: int, until_s: float) -> Floats:
     return np.column_stack([inputs.time_s[rows], x, y, yaw])
 
 
-def gather(
-    site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, str]] | None = None
-) -> Inputs | None:
+def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, str]] | None = None) -> Inputs | None:
     """Bring the tables that the track uses (`steps`, `odometry`, `compass`) into one order of time.
 
     A row with an empty cell tells nothing but its time. ``stated``: the pairs (emitter, receiver) whose ranges come
