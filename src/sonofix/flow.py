@@ -18,6 +18,7 @@ from sonofix.acquire.plan import acquire, make_plan
 from sonofix.acquire.roll import Roll
 from sonofix.locate.fix import fix
 from sonofix.locate.sound_speed import SoundSpeed
+from sonofix.locate.unstated import fix_by_residuals
 from sonofix.locate.whose import tell_whose
 from sonofix.ranging import range_epoch, stated_epochs
 from sonofix.records import (
@@ -25,6 +26,7 @@ from sonofix.records import (
     Detection,
     Estimate,
     Event,
+    Fix,
     Floats,
     Insight,
     Prediction,
@@ -182,7 +184,11 @@ class Street:
         """Take in the ranges of one epoch."""
         if self._start is not None:
             self._place(self._start, epoch.sync_s)
-        epoch, fixes, told = self.air.take(epoch, lambda e: tuple(fix(e, self.site, v.id) for v in self.site.vehicles))
+
+        def solve(asked: RangeEpoch) -> tuple[Fix, ...]:
+            return tuple(fix(asked, self.site, v.id) for v in self.site.vehicles)
+
+        epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
         before = self.follower.belief
         estimates, used, events = self.follower.step(epoch, fixes)
         believed = used.copy()
