@@ -19,6 +19,7 @@ from sonofix.acquire.plan import acquire, make_plan
 from sonofix.acquire.roll import Roll
 from sonofix.locate.fix import fix
 from sonofix.locate.sound_speed import SoundSpeed
+from sonofix.locate.unstated import fix_by_residuals
 from sonofix.locate.whose import tell_whose
 from sonofix.ranging import range_epoch, stated_epochs
 from sonofix.records import (
@@ -26,6 +27,7 @@ from sonofix.records import (
     Detection,
     Estimate,
     Event,
+    Fix,
     Floats,
     Insight,
     Prediction,
@@ -68,7 +70,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
         yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
     elif recording.ranges is not None:
         street = Street(recording.site, recording.tables.get("start"), rate_hz)
-        street.sense(recording.tables, stated=True)
+        street.sense(recording.tables, tuple(zip(recording.ranges.emitter, recording.ranges.receiver, strict=True)))
         for epoch in stated_epochs(recording.ranges, recording.site):
             yield street.walk(epoch)
     else:
@@ -252,10 +254,10 @@ class Street:
         self._start = start
         self._written_s: float | None = None
 
-    def sense(self, tables: Mapping[str, Table], stated: bool = False) -> None:
+    def sense(self, tables: Mapping[str, Table], stated: tuple[tuple[str, str], ...] | None = None) -> None:
         """Let what vehicles' own sensors tell of their motion enter, each row at its time; before the first epoch.
 
-        ``stated``: the ranges come from others, with errors of their own.
+        ``stated``: pairs (emitter, receiver) whose ranges come from others, with errors of their own.
         """
         inputs = gather(self.site, tables, stated)
         self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs)
@@ -263,7 +265,11 @@ class Street:
     def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
         """Take in the ranges of one epoch."""
         self.begin(epoch.sync_s)
-        epoch, fixes, told = self.air.take(epoch, lambda e: tuple(fix(e, self.site, v.id) for v in self.site.vehicles))
+
+        def solve(asked: RangeEpoch) -> tuple[Fix, ...]:
+            return tuple(fix(asked, self.site, v.id) for v in self.site.vehicles)
+
+        epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
         before = self.follower.belief
         estimates, used, events = self.follower.step(epoch, fixes)
         believed = used.copy()

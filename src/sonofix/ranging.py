@@ -17,6 +17,10 @@ from sonofix.site import Site
 RANGES_WITHOUT_SD_M = 0.1
 """Deviation taken for a stated range that states none: what radio ranging of the better kind shows."""
 
+TIMES_SD = 0.01
+"""Share by which times of flight that others state may all be too long, where a thermometer made ranges of them: air
+along the way that is not the thermometer's, and a clock that nobody checked."""
+
 SWEEP_S = 1.0
 """Stated ranges are gathered into epochs no longer than this."""
 
@@ -95,8 +99,12 @@ def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
     sweep: list[int] = []
     seen: set[tuple[str, str]] = set()
 
+    c = site.sound_speed_mps
+    speed_sd_mps = float(np.hypot(rows.speed_sd_mps, TIMES_SD * c)) if rows.speed_sd_mps else 0.0
+
     def close() -> None:
         at = np.array(sweep)
+        flight_m = flights_m(rows.range_m[at], not site.clock_known) * (speed_sd_mps / c)
         sd = np.full(len(at), np.nan) if rows.sd_m is None else rows.sd_m[at]
         epochs.append(
             RangeEpoch(
@@ -106,12 +114,15 @@ def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
                 receiver=tuple(rows.receiver[i] for i in sweep),
                 time_s=rows.time_s[at],
                 range_m=rows.range_m[at],
-                covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2),
+                covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2)
+                + np.outer(flight_m, flight_m),
                 range_rate_mps=None,
                 range_rate_sd_mps=None,
                 snr_db=None,
                 clock="known" if site.clock_known else "common",
-                sound_speed_mps=site.sound_speed_mps,
+                sound_speed_mps=c,
+                sound_speed_sd_mps=speed_sd_mps,
+                sd_stated=not np.isnan(sd).any(),
             )
         )
 

@@ -59,13 +59,17 @@ class ReferenceBurst:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeRows:
-    """Ranges that a recording states instead of samples; ``sd_m`` holds NaN where a row states none."""
+    """Ranges that a recording states instead of samples; ``sd_m`` holds NaN where a row states none.
+
+    ``speed_sd_mps``: deviation of the site's sound speed, where it made ranges of times of flight; else 0.
+    """
 
     time_s: Floats
     emitter: tuple[str, ...]
     receiver: tuple[str, ...]
     range_m: Floats
     sd_m: Floats | None
+    speed_sd_mps: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,6 +219,8 @@ class RangeEpoch:
     flags : tuple of str
     sound_speed_sd_mps : float
         Its deviation, which ``covariance_m2`` holds as what all ranges share; 0: taken as it is.
+    sd_stated : bool
+        False where nobody stated how good ranges are, so that ``covariance_m2`` holds an assumption.
     """
 
     index: int
@@ -231,6 +237,7 @@ class RangeEpoch:
     sound_speed_mps: float
     flags: tuple[str, ...] = ()
     sound_speed_sd_mps: float = 0.0
+    sd_stated: bool = True
 
     def __len__(self) -> int:
         """Return the number of rows."""

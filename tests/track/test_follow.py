@@ -14,6 +14,7 @@ from sonofix.records import Estimate, Event, Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track.belief import Motion, blank, estimate, predict, start_at
 from sonofix.track.follow import PATIENCE, Follower, expectations
+from sonofix.track.inputs import gather
 
 PLACE = (3.0, 5.5, 1.1)
 PERIOD_S = 0.5
@@ -295,7 +296,8 @@ def test_stated_ranges_that_err_more_than_they_say_are_trusted_less(rng: np.rand
     site = make_site(HALL)
     wrong = drive_past(site, Drive(PLACE), 60, rng, sd_m=0.2, stated=True)
     claimed = [replace(e, covariance_m2=0.02**2 * np.eye(6)) for e in wrong]
-    seen = list(follow(Follower(site, Motion(acceleration_psd=0.01)), claimed))
+    others = gather(site, {}, [(b.id, m.id) for b in site.beacons for m in site.microphones])
+    seen = list(follow(Follower(site, Motion(acceleration_psd=0.01), inputs=others), claimed))
     assert max(sigmas(s.only, np.array(PLACE)) for s in seen[30:]) < 5
 
 

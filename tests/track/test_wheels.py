@@ -155,7 +155,8 @@ def test_stated_ranges_that_are_all_too_long_are_found_out(rng: np.random.Genera
     # round a circle of 1.5 m, every range 5 % too long: a fix of each epoch alone is decimetres off
     times = np.arange(0.0, 60.0, 0.1)
     street, miss = Street(SITE), []
-    street.sense({"odometry": odometry(np.column_stack([times, 0.6 + 0 * times, 0.4 + 0 * times]))}, stated=True)
+    pairs = tuple((b.id, m.id) for b in SITE.beacons for m in SITE.microphones)
+    street.sense({"odometry": odometry(np.column_stack([times, 0.6 + 0 * times, 0.4 + 0 * times]))}, stated=pairs)
     for k in range(119):
         time_s = 0.5 * k + 0.05
         place = (5.0 + 1.5 * np.sin(0.4 * time_s), 4.0 - 1.5 * np.cos(0.4 * time_s), 1.1)

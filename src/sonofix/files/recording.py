@@ -171,16 +171,17 @@ def _range_rows(table: Table, site: Site) -> RangeRows:
     """Ranges as stated, or times of flight with the site's sound speed."""
     columns = table.columns
     if "range_m" in columns:
-        range_m, column = columns["range_m"], "range_m"
+        range_m, column, speed_sd = columns["range_m"], "range_m", 0.0
     else:
         range_m, column = columns["time_of_flight_s"] * site.sound_speed_mps, "time_of_flight_s"
+        speed_sd = site.sound_speed_sd_mps
     if site.schedule is None or site.schedule.synchronised:
         below = np.flatnonzero(range_m < 0)
         if len(below):
             value = float(columns[column][below[0]])
             remedy = f"{len(below)} rows are below 0, which only an unknown clock could explain (synchronised = false)"
             raise RecordingError([Problem("ranges.csv", column, value, remedy)])
-    return RangeRows(columns["time_s"], table.names["from"], table.names["to"], range_m, columns.get("sd_m"))
+    return RangeRows(columns["time_s"], table.names["from"], table.names["to"], range_m, columns.get("sd_m"), speed_sd)
 
 
 def _with_period(site: Site, sync: Table | None) -> Site:

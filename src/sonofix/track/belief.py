@@ -12,16 +12,17 @@ from sonofix.geometry import PITCH, POSE, ROLL, SIZE, YAW, from_arm, open_arms, 
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
-from sonofix.track import steps, wheels
+from sonofix.track import stated, steps, wheels
 from sonofix.track.anchor import lift
 from sonofix.track.inputs import STEP, WHEELS, Inputs
+from sonofix.track.stated import Trust
 from sonofix.track.tilt import open_tilt, rock
 
 SOUND_SPEED_MPS = 343.0
 """Near enough to turn a clock's speed into m/s."""
 
-RANGE_SCALE_SD, RANGE_BIAS_SD_M = 0.05, 0.1
-"""Of ranges stated by others: by what share of the way, and by how much, all may be too long."""
+LOOSE = 0.5
+"""Deviation in m and rad with which a place is taken that ranges stated by others gave: they speak again at once."""
 
 INSTANT_S = 1e-9
 """Instants that differ by less are one: nothing moves meanwhile."""
@@ -76,6 +77,8 @@ class Belief:
         Where measurements are linearised; None: at ``mean``.
     tilt_sd_rad : float64 (V,) or None
         How far each vehicle tilts (`geometry.tilting`); None: all stand upright.
+    trust : Trust or None
+        What has been learnt of ranges that others state; None where ranges are our own.
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -88,6 +91,7 @@ class Belief:
     inputs: Inputs | None = None
     about: Nominal | None = None
     tilt_sd_rad: Floats | None = None
+    trust: Trust | None = None
 
     def tilts(self, vehicle: int) -> float:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
@@ -124,11 +128,10 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
             for slot in slots[slots >= 0]:
                 room.begin(covariance, free, int(slot))
         if inputs.range_slot >= 0:
-            for i, sd in ((0, RANGE_SCALE_SD), (1, RANGE_BIAS_SD_M)):
-                covariance[inputs.range_slot + i, inputs.range_slot + i] = sd**2
-                free[inputs.range_slot + i] = True
+            stated.begin(mean, covariance, free, inputs.range_slot, len(inputs.pairs))
+    trust = stated.trust(len(inputs.pairs)) if inputs is not None and inputs.range_slot >= 0 else None
     placed = np.zeros(len(site.vehicles), bool)
-    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site))
+    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site), trust=trust)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -189,6 +192,8 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
                 steps.wander(mean, covariance, vehicle, step, until_s - now_s, bool(belief.placed[vehicle]))
             if wheel >= 0:
                 wheels.wander(covariance, free, vehicle, wheel, until_s - now_s)
+        if belief.trust is not None:
+            stated.wander(mean, covariance, inputs.range_slot, belief.trust, until_s - now_s)
         if row is not None and belief.placed[inputs.vehicle[row]]:
             about = None if belief.about is None else belief.near(belief.about.row[row], mean)
             _sense(mean, covariance, free, inputs, row, about)
@@ -261,6 +266,14 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
     placed = belief.placed.copy()
     placed[vehicle] = True
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
+
+
+def loosen(belief: Belief, vehicle: int) -> Belief:
+    """Return a belief in which a fix only says where a vehicle's track begins: it knew nothing of shared errors."""
+    covariance, at = belief.covariance.copy(), SIZE * vehicle
+    for i in range(at, at + YAW + 1):
+        covariance[i, i] += LOOSE**2 if belief.free[i] else 0.0
+    return replace(belief, covariance=covariance)
 
 
 def start_at(

@@ -12,9 +12,10 @@ from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
-from sonofix.track.belief import Belief, Motion, blank, estimate, place, predict, reopen, start_at
+from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
+from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
 from sonofix.track.update import strangeness, update
 
 PATIENCE = 3
@@ -24,8 +25,11 @@ CONTRADICTED = 30.0
 """Squared distance of a fix from the track, over its expected value per axis, at which the fix is followed at once:
 noise alone comes there once in three million epochs."""
 
-DOUBT_RATE = 0.05
-"""How fast the variance of stated ranges is scaled, per range."""
+AGILITY_RATE = 0.1
+"""How fast the density of acceleration follows, per epoch."""
+
+AGILITY = (1e-3, 2.0)
+"""Least and most that it may become, in m²/s³."""
 
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
@@ -59,7 +63,11 @@ class Follower:
         self._heard = np.zeros(len(site.vehicles), bool)
         self._recent: list[RangeEpoch] = []
         self._lag_s = 0.0
-        self._doubt = 1.0
+        self._rival: Rival | None = None
+        self._looked_s = -np.inf
+        self._pushed: Floats | None = None
+        self._begun_s = np.full(len(site.vehicles), -np.inf)
+        self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
@@ -97,16 +105,14 @@ class Follower:
         self._clock(epoch, fixes)
         self._gather(epoch)
         taken = self._place(links, fixes, events)
-        stated = epoch.snr_db is None
-        asked = self.trusted(epoch)
         # ranges that placed a vehicle have had their say
         before = self.belief
-        self.belief, used, surprise = update(before, asked, links, candidates & ~taken)
-        if before.inputs is not None:
-            used = self._slipped(before, asked, links, candidates & ~taken, used, events)
+        self.belief, used, _ = update(before, epoch, links, candidates & ~taken)
+        if before.inputs is not None and len(before.inputs.time_s):
+            used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
         used |= taken
-        if stated:
-            self._learn(surprise)
+        self._loosen(before)
+        used = self._contest(epoch, links, candidates, used, events)
         self.belief = self._course.head(self.belief)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
@@ -178,18 +184,66 @@ class Follower:
         free[-2:] = True
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
 
-    def trusted(self, epoch: RangeEpoch) -> RangeEpoch:
-        """Return an epoch with the variances that stated ranges have been found to have."""
-        return replace(epoch, covariance_m2=self._doubt * epoch.covariance_m2) if epoch.snr_db is None else epoch
+    def _loosen(self, before: Belief) -> None:
+        """Let vehicles be as agile as their track shows, where ranges are stated by others and nothing else tells.
 
-    def _learn(self, surprise: Floats) -> None:
-        """Scale the variance that stated ranges claim until their innovations agree with it.
-
-        Ranges stated by others come with rough deviations or none, and with errors that no deviation tells of.
+        Corrections of velocity that follow each other agree in direction where motion is taken as too calm, and
+        oppose each other where it is taken as too free (Mehra 1970: innovations of an optimal filter are white).
         """
-        for value in surprise:
-            self._doubt *= float(np.exp(DOUBT_RATE * (min(value, 9.0) - 1.0)))
-        self._doubt = float(np.clip(self._doubt, 1.0, 1e4))
+        inputs = before.inputs
+        if before.trust is None or inputs is None or len(inputs.time_s) or not before.placed.any():
+            return
+        now = (self.belief.pose() - before.pose())[before.placed, 4:6].ravel()
+        last, self._pushed = self._pushed, now
+        size = float(np.linalg.norm(now))
+        if last is None or last.shape != now.shape or size * float(np.linalg.norm(last)) == 0.0:
+            return
+        agree = float(now @ last) / (size * float(np.linalg.norm(last)))
+        psd = self.motion.acceleration_psd * float(np.exp(AGILITY_RATE * agree))
+        self.motion = replace(self.motion, acceleration_psd=float(np.clip(psd, *AGILITY)))
+
+    def _contest(
+        self,
+        epoch: RangeEpoch,
+        links: Links,
+        asked: NDArray[np.bool_],
+        used: NDArray[np.bool_],
+        events: list[Event],
+    ) -> NDArray[np.bool_]:
+        """Where ranges are stated by others, follow a second place beside the track as long as either may be true.
+
+        Returns the rows used.
+        """
+        trust, rival = self.belief.trust, self._rival
+        if trust is None or not len(epoch) or not self.belief.placed.any():
+            return used
+        if rival is not None:
+            rival = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
+            self._rival = None if rival.lost or rival.won else rival
+            self._undecided[rival.vehicle] &= self._rival is not None
+            if rival.won:
+                self.belief = follows(self.belief, rival.belief)
+                self._refused[rival.vehicle] = 0
+                x, y, z = estimate(self.belief, self.site, rival.vehicle, "fused").position_m
+                text = f"another place is likelier by far: ({x:.3f}, {y:.3f}, {z:.3f}) m"
+                events.append(Event(self.belief.time_s, self.site.vehicles[rival.vehicle].id, "reset", text))
+                return asked.copy()
+        elif self.belief.time_s - self._looked_s >= ASKED_S:
+            self._looked_s = self.belief.time_s
+            for who in np.flatnonzero(self.belief.placed).tolist():
+                if self._rival is None and np.any(self._touches(links, who)):
+                    found = self._gathered(self.site.vehicles[who].id)
+                    young = self.belief.time_s - self._begun_s[who] < TRIED_S
+                    for other in (found, image(self.belief, who, links, found))[: 1 + young]:
+                        self._rival = self._rival or beside(self.belief, who, other, self._arms[who])
+                    if young and self._rival is not None and self._rival.vehicle == who:
+                        self._undecided[who] = True
+        return used
+
+    @property
+    def hidden(self) -> frozenset[int]:
+        """Vehicles of which nothing is told yet: a second start may be true."""
+        return frozenset(np.flatnonzero(self._undecided).tolist())
 
     @property
     def _corrected(self) -> bool:
@@ -219,7 +273,11 @@ class Follower:
                 place(aged, who, start, self._arms[who], self.motion.tilt_pace_radps), self.belief.time_s, self.motion
             )
             self._refused[who], self._heard[who] = 0, True
-            taken |= start.used if start is found else self._touches(links, who)
+            if self._corrected:
+                self.belief = loosen(self.belief, who)
+                self._begun_s[who] = self.belief.time_s
+            else:
+                taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
             events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
@@ -262,6 +320,10 @@ class Follower:
         if self._corrected and self.belief.inputs is not None:
             scale, bias_m = self.belief.mean[self.belief.inputs.range_slot :][:2]
             merged = replace(merged, range_m=(merged.range_m - bias_m) / (1.0 + scale))
+            if self.belief.trust is not None:
+                numbers = np.array([self.belief.inputs.pairs[pair] for pair in latest])
+                own_m2 = self.belief.trust.extra(numbers) + self.belief.trust.variance[:, numbers].sum(axis=0)
+                merged = replace(merged, covariance_m2=merged.covariance_m2 + np.diag(own_m2))
         return fix(merged, self.site, vehicle)
 
     def _touches(self, links: Links, who: int) -> NDArray[np.bool_]:
@@ -298,7 +360,7 @@ class Follower:
 
     def _estimates(self, links: Links, used: NDArray[np.bool_]) -> tuple[Estimate, ...]:
         out = []
-        for who in np.flatnonzero(self.belief.placed):
+        for who in np.flatnonzero(self.belief.placed & ~self._undecided):
             entered = bool((used & self._touches(links, int(who))).any())
             out.append(estimate(self.belief, self.site, int(who), "fused" if entered else "predicted"))
         return tuple(out)

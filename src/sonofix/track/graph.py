@@ -23,7 +23,7 @@ from sonofix.track.follow import SLIPPED_M, Follower
 from sonofix.track.inputs import COMPASS, STEP
 from sonofix.track.passage import YAW, Heard, Mark, Passage
 from sonofix.track.smooth import PASSES, settle, track
-from sonofix.track.update import _expected
+from sonofix.track.update import expect, pairs_of
 
 FLOOR = 1e-3
 """What any state may stray by from knot to knot, of its own deviation: a graph knows no constants."""
@@ -220,10 +220,13 @@ class Problem:
         measured = epoch.range_m[rows]
         if epoch.range_rate_mps is not None:
             measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
-        noise, links, stated = row_noise(epoch, links, rows, dt), links.rows(rows), epoch.snr_db is None
+        noise, links, pair = row_noise(epoch, links, rows, dt), links.rows(rows), np.zeros(0, np.int64)
+        if node.belief.trust is not None and epoch.snr_db is None:
+            pair = pairs_of(node.belief, epoch, rows)
+            noise[np.diag_indices(len(rows))] += node.belief.trust.extra(pair)
 
         def miss(_factor: Any, values: Any, jacobians: Any) -> Floats:
-            shown, derivative = _expected(links, node.belief, node.whole(values.atVector(k)), dt, epoch, stated)
+            shown, derivative = expect(links, node.belief, node.whole(values.atVector(k)), dt, epoch, pair)
             if jacobians is not None:
                 jacobians[0] = node.by(derivative)
             return shown - measured

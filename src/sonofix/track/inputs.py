@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import SIZE, open_arms
 from sonofix.records import Floats, Table
 from sonofix.site import Site
+from sonofix.track import stated as others
 from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
 
 STEP_STATES = ("anchor_x", "anchor_y", "length", "heading")
@@ -20,9 +21,6 @@ long, by what angle its heading too far left."""
 WHEEL_STATES = ("anchor_x", "anchor_y", "anchor_yaw", "scale", "bias")
 """What odometry adds: the pose at its row before, by what share of itself its speed is told too high, and its yaw rate
 at rest."""
-
-RANGE_STATES = ("range_scale", "range_bias")
-"""What ranges stated by others add: by what share of the way, and by how much, all of them are too long."""
 
 STEP, WHEELS, COMPASS = range(3)
 
@@ -47,9 +45,11 @@ class Inputs:
     arm : float64 (V, 2)
         `geometry.open_arms`.
     range_slot : int
-        Where `RANGE_STATES` stand; −1: ranges are our own, and right.
+        Where the errors of ranges that others state stand (`track.stated`); −1: ranges are our own, and right.
     size : int
         How many states are added in all.
+    pairs : mapping from (emitter, receiver) to int
+        Number of each pair whose ranges others state.
     """
 
     time_s: Floats
@@ -62,6 +62,7 @@ class Inputs:
     arm: Floats
     range_slot: int
     size: int
+    pairs: Mapping[tuple[str, str], int]
 
     def within(self, after_s: float, until_s: float) -> range:
         """Rows told after one instant and until another; none where the second is before the first."""
@@ -79,10 +80,11 @@ def reckoned(inputs: Inputs, vehicle: int, until_s: float) -> Floats:
     return np.column_stack([inputs.time_s[rows], x, y, yaw])
 
 
-def gather(site: Site, tables: Mapping[str, Table], stated: bool = False) -> Inputs | None:
-    """Bring the tables that the track uses (`steps`, `odometry`, `compass`) into one order of time; None without any.
+def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, str]] | None = None) -> Inputs | None:
+    """Bring the tables that the track uses (`steps`, `odometry`, `compass`) into one order of time.
 
-    A row with an empty cell tells nothing but its time. ``stated``: ranges come from others, with errors of their own.
+    A row with an empty cell tells nothing but its time. ``stated``: the pairs (emitter, receiver) whose ranges come
+    from others, with errors of their own; None where ranges are our own. None where there is neither.
     """
     ids = [v.id for v in site.vehicles]
     parts: list[tuple[Floats, NDArray[np.int64], NDArray[np.int64], Floats]] = []
@@ -99,7 +101,10 @@ def gather(site: Site, tables: Mapping[str, Table], stated: bool = False) -> Inp
                 count = np.count_nonzero(rows)
                 parts.append((own["time_s"], np.full(count, kind), np.full(count, i), _values(kind, own)))
     if not parts:
-        return None
+        if stated is None:
+            return None
+        none = np.zeros(0, np.int64)
+        parts.append((np.zeros(0), none, none, np.zeros((0, 4))))
     time_s, kinds, vehicle, value = (np.concatenate(p) for p in zip(*parts, strict=True))
     order = np.argsort(time_s, kind="stable")
     # only a compass tells what odometry did not see; without one the doubt would stay
@@ -110,8 +115,9 @@ def gather(site: Site, tables: Mapping[str, Table], stated: bool = False) -> Inp
         for i in np.unique(vehicle[kinds == kind]).tolist():
             slots[kind, i] = SIZE * len(ids) + size
             size += len(states)
-    range_slot = SIZE * len(ids) + size if stated else -1
-    size += len(RANGE_STATES) if stated else 0
+    pairs = {pair: i for i, pair in enumerate(dict.fromkeys(stated or ()))}
+    range_slot = SIZE * len(ids) + size if stated is not None else -1
+    size += others.size(len(pairs)) if stated is not None else 0
     headed = np.array([bool(np.any((vehicle == i) & (kinds != STEP))) for i in range(len(ids))])
     return Inputs(
         time_s[order],
@@ -124,6 +130,7 @@ def gather(site: Site, tables: Mapping[str, Table], stated: bool = False) -> Inp
         open_arms(site),
         range_slot,
         size,
+        pairs,
     )
 
 

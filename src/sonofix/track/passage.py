@@ -27,7 +27,7 @@ ANY_HEADING_RAD = float(np.pi / np.sqrt(3))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entered:
-    """What an epoch did to the filter: its ranges as they were trusted, which of them entered, and its events."""
+    """What an epoch did to the filter: its ranges, which of them entered, and its events."""
 
     ranges: RangeEpoch
     used: NDArray[np.bool_]
@@ -39,13 +39,14 @@ class Mark:
     """What a knot is for.
 
     ``epoch`` is the number of that it belongs to, ``rows`` those of the inputs that it stands just before; ``told``: it
-    is a row of the track; ``entered``: it is its epoch's end.
+    is a row of the track; ``entered``: it is its epoch's end; ``hidden``: vehicles of which nothing is told.
     """
 
     epoch: int
     rows: tuple[int, ...] = ()
     told: bool = False
     entered: Entered | None = None
+    hidden: frozenset[int] = frozenset()
 
     @property
     def ends(self) -> bool:
@@ -110,13 +111,12 @@ class Passage:
         if self._guide is not None:
             about = Nominal(self._guide.row, self._guide.now[self.epochs])
             follower.belief = replace(follower.belief, about=about)
-        trusted = follower.trusted(epoch)
         _, used, events = follower.step(epoch, fixes)
         for opening in self._guide.openings if self._guide is not None else ():
             if opening.epoch == self.epochs:
                 follower.belief = _opened(follower.belief, opening)
         if follower.belief.placed.any():
-            self._knot(Mark(self.epochs, told=self._rate_hz is None, entered=Entered(trusted, used, events)))
+            self._knot(Mark(self.epochs, told=self._rate_hz is None, entered=Entered(epoch, used, events)))
             if self._rate_hz is not None and self._written is None:
                 self._written = int(np.ceil(follower.belief.time_s * self._rate_hz))
         self.epochs += 1
@@ -142,7 +142,7 @@ class Passage:
 
     def _knot(self, mark: Mark) -> None:
         self.follower.belief = self.chain.knot(self.follower.belief)
-        self.marks.append(mark)
+        self.marks.append(replace(mark, hidden=self.follower.hidden))
 
     def back(self) -> Iterator[tuple[Mark, Belief]]:
         """Return knots smoothed, last first."""

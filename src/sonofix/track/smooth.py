@@ -69,7 +69,7 @@ def track(
     for mark, belief in smoothed:
         first = belief
         if mark.told:
-            out[mark.epoch][:0] = estimates(belief, passage.follower)
+            out[mark.epoch][:0] = estimates(belief, passage.follower, mark.hidden)
     if first is not None:
         for epoch, belief in earlier(passage, heard, first, rate_hz):
             out[epoch] += estimates(belief, passage.follower)
@@ -147,7 +147,7 @@ class FixedLag:
         if out:
             for mark, belief in self._passage.back():
                 if mark.told and self._left <= mark.epoch < epochs:
-                    out[mark.epoch - self._left][:0] = estimates(belief, self._passage.follower)
+                    out[mark.epoch - self._left][:0] = estimates(belief, self._passage.follower, mark.hidden)
         self._left = max(epochs, self._left)
         # the last knot's copy travels on
         self._passage.forget(min(knots, len(self._passage.marks) - 1))
@@ -163,6 +163,8 @@ def earlier(
     has another clock in each. Yields the rows of the track in order of time, each with its epoch.
     """
     begun = next(mark.epoch for mark in passage.marks if mark.ends)
+    if passage.marks[0].hidden:
+        return
     sound = {fix.vehicle for fix in heard[begun][1] if fix.position_m is not None}
     names = [passage.follower.site.vehicles[who].id for who in np.flatnonzero(first.placed)]
     if passage.follower.free_running or not passage.marks[0].ends or not sound.issuperset(names):
@@ -181,8 +183,7 @@ def earlier(
                 rows.append(k)
         belief = predict(belief, time_s, passage.follower.motion)
         links = link(site, epoch.emitter, epoch.receiver)
-        asked = passage.follower.trusted(epoch)
-        belief, _, _ = update(belief, asked, links, np.isfinite(epoch.range_m))
+        belief, _, _ = update(belief, epoch, links, np.isfinite(epoch.range_m))
         own = [SIZE * who + i for who in np.flatnonzero(first.placed) for i in (0, 1)]
         if belief.covariance[own, own].max() > BACK_SD_M**2:
             break
@@ -194,6 +195,7 @@ def earlier(
             yield k, smoothed
 
 
-def estimates(belief: Belief, follower: Follower) -> list[Estimate]:
-    """Return what a smoothed belief says of each vehicle."""
-    return [estimate(belief, follower.site, int(who), "smoothed") for who in np.flatnonzero(belief.placed)]
+def estimates(belief: Belief, follower: Follower, hidden: frozenset[int] = frozenset()) -> list[Estimate]:
+    """Return what a smoothed belief says of each vehicle that may be told of."""
+    told = [who for who in np.flatnonzero(belief.placed).tolist() if who not in hidden]
+    return [estimate(belief, follower.site, who, "smoothed") for who in told]

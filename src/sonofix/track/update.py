@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import Links, rows_at
 from sonofix.locate.noise import row_noise
 from sonofix.records import Floats, RangeEpoch
+from sonofix.track import stated
 from sonofix.track.belief import Belief
 
 GATE_SIGMA = 5.0
@@ -48,32 +49,43 @@ def update(
     dt = epoch.time_s[rows] - belief.time_s
     noise = row_noise(epoch, links, rows, dt)
     measured = epoch.range_m[rows]
-    stated = epoch.snr_db is None
+    trust, claimed = belief.trust if epoch.snr_db is None else None, noise.diagonal().copy()
+    pair = pairs_of(belief, epoch, rows) if trust is not None else np.zeros(0, np.int64)
+    if trust is not None:
+        noise[np.diag_indices(len(rows))] += trust.extra(pair)
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
     links = links.rows(rows)
     mean = belief.mean if belief.about is None else belief.near(belief.about.now, belief.mean)
-    shown, derivative = _expected(links, belief, mean, dt, epoch, stated)
+    shown, derivative = expect(links, belief, mean, dt, epoch, pair)
     miss = measured - shown - derivative @ (belief.mean - mean)
     crossed = derivative @ belief.covariance
-    surprise = miss**2 / (np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal())
+    spread = np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal()
+    surprise = miss**2 / spread
     # a row is believed where its range is, and its rate if it has one
     near = (surprise <= GATE_SIGMA**2).reshape(-1, len(rows)).all(axis=0)
     surprise = surprise[: len(rows)]
     if len(rows) > 2 and 2 * np.count_nonzero(near) < len(rows):
         # most disagree: those that do not may do so by chance, and would drag the track along
         near[:] = False
+    asked = (links, dt, measured, pair)
+    if trust is not None:
+        # the noise of others' ranges has heavy tails: what is far off counts less before it counts for nothing
+        trust = replace(trust, told=stated.log_likelihood(surprise, spread))
+        noise[np.diag_indices(len(rows))] *= stated.heavier(surprise)
+        belief = replace(belief, trust=trust)
     if not near.any():
         return belief, used, surprise
     used[rows[near]] = True
     if not near.all():
         both = np.tile(near, 2) if with_rates else near
         links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
+        pair = pair if trust is None else pair[near]
         miss, derivative, crossed = miss[both], derivative[both], crossed[both]
     gain = np.zeros((0, 0))
     for k in range(iterations if belief.about is None else 1):
         if k:
-            shown, derivative = _expected(links, belief, mean, dt, epoch, stated)
+            shown, derivative = expect(links, belief, mean, dt, epoch, pair)
             miss, crossed = measured - shown - derivative @ (belief.mean - mean), derivative @ belief.covariance
         gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
         moved = belief.mean + gain @ miss
@@ -83,22 +95,44 @@ def update(
             break
     keep = np.eye(len(mean)) - gain @ derivative
     covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
-    return replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2), used, surprise
+    after = replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2)
+    return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
 
 
-def _expected(
-    links: Links, belief: Belief, mean: Floats, dt: Floats, epoch: RangeEpoch, stated: bool
+def pairs_of(belief: Belief, epoch: RangeEpoch, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of each row's pair."""
+    known = {} if belief.inputs is None else belief.inputs.pairs
+    return np.array([known[epoch.emitter[i], epoch.receiver[i]] for i in rows], np.int64)
+
+
+def _learn(
+    belief: Belief,
+    trust: stated.Trust,
+    epoch: RangeEpoch,
+    asked: tuple[Links, Floats, Floats, NDArray[np.int64]],
+    claimed: Floats,
+) -> Belief:
+    """Learn from what a corrected belief makes of all rows asked, refused ones too; ``claimed`` (n,) in m²."""
+    links, dt, measured, pair = asked
+    slot = -1 if belief.inputs is None else belief.inputs.range_slot
+    shown, derivative = expect(links, belief, belief.mean, dt, epoch, pair)
+    square = (measured - shown) ** 2 + np.einsum("ij,ij->i", derivative @ belief.covariance, derivative)
+    at = stated.places(slot, pair, len(trust.count) - 1)
+    apart = belief.mean[at]
+    apart[0] -= apart[0].mean()  # what all pairs share is the common bias's
+    errors = apart**2 + belief.covariance[at, at]
+    return replace(belief, trust=trust.after(pair, square, claimed, errors))
+
+
+def expect(
+    links: Links, belief: Belief, mean: Floats, dt: Floats, epoch: RangeEpoch, pair: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
     """Return what rows would show at a mean, and its derivative; ranges stated by others with errors of their own."""
     clock, rates = epoch.clock == "common", epoch.range_rate_mps is not None
     shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates)
-    if stated and belief.inputs is not None and belief.inputs.range_slot >= 0:
-        slot, n = belief.inputs.range_slot, len(dt)
-        derivative *= 1.0 + mean[slot]
-        derivative[:n, slot], derivative[:n, slot + 1] = shown[:n], 1.0
-        shown = shown * (1.0 + mean[slot])
-        shown[:n] += mean[slot + 1]
-    return shown, derivative
+    if belief.inputs is None or not len(pair):
+        return shown, derivative
+    return stated.show(mean, belief.inputs.range_slot, pair, len(belief.inputs.pairs), shown, derivative)
 
 
 def strangeness(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]) -> float:
@@ -106,10 +140,14 @@ def strangeness(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[
     placed = np.append(belief.placed, True)
     rows = np.flatnonzero(asked & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
     dt = epoch.time_s[rows] - belief.time_s
-    shown, derivative = _expected(links.rows(rows), belief, belief.mean, dt, epoch, epoch.snr_db is None)
+    others = belief.trust is not None and epoch.snr_db is None
+    pair = pairs_of(belief, epoch, rows) if others else np.zeros(0, np.int64)
+    shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
     measured = epoch.range_m[rows]
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
     expected = derivative @ belief.covariance @ derivative.T + row_noise(epoch, links, rows, dt)
+    if others and belief.trust is not None:
+        expected[np.diag_indices(len(rows))] += belief.trust.extra(pair)
     miss = measured - shown
     return float(miss @ np.linalg.solve(expected, miss) + np.linalg.slogdet(expected)[1])

@@ -1,0 +1,174 @@
+"""Ranges stated by others: the errors that they carry for seconds and minutes, and how far each can be trusted.
+
+A range is stated as (1 + k) r + b + s + q + noise: k and b are common to all, s (slow) and q (quick) are first-order
+Gauss-Markov processes of each pair of an emitter and a receiver. How large s, q and the noise are is learnt from the
+ranges themselves, pair by pair with all pairs as the prior (docs/track.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Floats
+
+SCALE_SD = 0.05
+"""Of the share of the way by which all ranges are too long; it stays what it is."""
+
+BIAS_SD_M = 0.1
+"""Of what all ranges are too long by; it stays what it is."""
+
+COMMON = 2
+"""States that all pairs share: scale and bias."""
+
+KINDS = 2
+"""Errors of each pair: slow, quick."""
+
+BEGIN_SD_M = 0.1
+"""Of slow errors, of quick ones and of noise beyond what is stated, each, before ranges have told."""
+
+CORRELATED_S = np.array([3000.0, 2.0])
+"""Of slow errors (antennas, walls) and of quick ones (multipath along the way)."""
+
+FREEDOM = 4.0
+"""Of Student's t distribution, as which noise is taken: outliers of many metres then weigh next to nothing."""
+
+REMEMBERED = 100.0
+"""Ranges of a pair by which its noise is judged; of all pairs ten times as many."""
+
+POOL = 10.0
+"""Ranges of a pair that weigh as much as what all pairs show."""
+
+RATE = 0.02
+"""How fast variances of slow and quick errors follow, per range."""
+
+MOST = 9.0
+"""A single square counts as at most so many variances."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trust:
+    """What has been learnt of P pairs; a new one with each epoch.
+
+    Attributes
+    ----------
+    count, square, stated : float64 (P + 1,)
+        Ranges of each pair, faded; sums of their squared residuals and of the variances they stated; last: of all.
+    own, weight : float64 (2, P)
+        Sums of squared slow and quick errors, and their number, faded.
+    pool : float64 (2,)
+        Variance (m²) of slow and quick errors over all pairs.
+    told : float
+        Logarithm of the likelihood of the epoch just taken in.
+    """
+
+    count: Floats
+    square: Floats
+    stated: Floats
+    own: Floats
+    weight: Floats
+    pool: Floats
+    told: float = 0.0
+
+    @property
+    def variance(self) -> Floats:
+        """Variances (2, P) of each pair's slow and quick errors, in m²."""
+        return (self.own + POOL * self.pool[:, None]) / (self.weight + POOL)
+
+    def extra(self, pair: NDArray[np.int64]) -> Floats:
+        """Variance (n,) in m² that rows of some pairs have beyond what they state."""
+        every = (self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
+        beyond = self.square[pair] - self.stated[pair] + POOL * every
+        return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
+
+    def anew(self) -> Trust:
+        """Return what another track may begin with: noise as large, soon forgotten; errors as before anything."""
+        few = min(1.0, POOL / max(float(self.count[-1]), 1e-9))
+        begun = trust(len(self.count) - 1)
+        return replace(begun, count=few * self.count, square=few * self.square, stated=few * self.stated)
+
+    def after(self, pair: NDArray[np.int64], square: Floats, stated: Floats, errors: Floats) -> Trust:
+        """Return what is known after another epoch, one expectation-maximisation step on (Särkkä & Nummenmaa 2009).
+
+        Parameters
+        ----------
+        pair : int (n,)
+        square, stated : float64 (n,)
+            Squared residual and the variance of what the belief expects there, in sum; variance stated.
+        errors : float64 (2, n)
+            The same of the rows' slow and quick errors: square of the mean, and variance.
+        """
+        noise = stated + self.extra(pair)
+        counted = (FREEDOM + 1.0) / (FREEDOM + square / noise) * square
+        count, squares, claims = self.count.copy(), self.square.copy(), self.stated.copy()
+        own, weight, pool = self.own.copy(), self.weight.copy(), self.pool.copy()
+        errors = np.minimum(errors, MOST * self.variance[:, pair])
+        for i, k in enumerate(pair.tolist()):
+            for at, keep in ((k, 1.0 - 1.0 / REMEMBERED), (-1, 1.0 - 0.1 / REMEMBERED)):
+                count[at] = keep * count[at] + 1.0
+                squares[at] = keep * squares[at] + counted[i]
+                claims[at] = keep * claims[at] + stated[i]
+            own[:, k] = (1.0 - RATE) * own[:, k] + errors[:, i]
+            weight[:, k] = (1.0 - RATE) * weight[:, k] + 1.0
+        pool += RATE * (errors.mean(axis=1) - pool)
+        return replace(self, count=count, square=squares, stated=claims, own=own, weight=weight, pool=pool)
+
+
+def trust(pairs: int) -> Trust:
+    """Return what is known of so many pairs before anything was heard."""
+    every, each = np.zeros(pairs + 1), np.zeros((KINDS, pairs))
+    return Trust(every, every, every, each, each, np.full(KINDS, BEGIN_SD_M**2))
+
+
+def size(pairs: int) -> int:
+    """How many states stated ranges of so many pairs add."""
+    return COMMON + KINDS * pairs
+
+
+def begin(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, pairs: int) -> None:
+    """Open all errors, in place, before anything is known of them."""
+    own = slice(slot, slot + size(pairs))
+    mean[own] = covariance[own, :] = covariance[:, own] = 0.0
+    variances = np.concatenate([[SCALE_SD**2, BIAS_SD_M**2], np.full(KINDS * pairs, BEGIN_SD_M**2)])
+    covariance[own, own] = np.diag(variances)
+    free[own] = True
+
+
+def wander(mean: Floats, covariance: Floats, slot: int, known: Trust, dt: float) -> None:
+    """Let slow and quick errors age by ``dt``, in place (Gelb 1974, section 3.7)."""
+    own = slice(slot + COMMON, slot + COMMON + known.own.size)
+    fade = np.repeat(np.exp(-abs(dt) / CORRELATED_S), known.own.shape[1])
+    mean[own] *= fade
+    covariance[own, :] *= fade[:, None]
+    covariance[:, own] *= fade
+    at = np.arange(own.start, own.stop)
+    covariance[at, at] += known.variance.ravel() * (1.0 - fade**2)
+
+
+def places(slot: int, pair: NDArray[np.int64], pairs: int) -> NDArray[np.int64]:
+    """Where the slow and quick errors of rows stand in a belief (2, n)."""
+    return slot + COMMON + pairs * np.arange(KINDS)[:, None] + pair
+
+
+def show(
+    mean: Floats, slot: int, pair: NDArray[np.int64], pairs: int, shown: Floats, derivative: Floats
+) -> tuple[Floats, Floats]:
+    """Return what rows would show (n,), and its derivative (n, states), once errors are added to what geometry says."""
+    derivative = derivative * (1.0 + mean[slot])
+    derivative[:, slot], derivative[:, slot + 1] = shown, 1.0
+    at = places(slot, pair, pairs)
+    derivative[np.arange(len(pair)), at] = 1.0
+    return shown * (1.0 + mean[slot]) + mean[slot + 1] + mean[at].sum(axis=0), derivative
+
+
+def heavier(surprise: Floats) -> Floats:
+    """Return the factor on a row's variance that Student's t asks for, by its squared innovation over its variance."""
+    return np.maximum((FREEDOM + surprise) / (FREEDOM + 1.0), 1.0)
+
+
+def log_likelihood(surprise: Floats, variance: Floats) -> float:
+    """Sum of rows' logarithms of Student's t density, but for a constant a row."""
+    each = (FREEDOM + 1.0) * np.log1p(surprise / FREEDOM) + np.log(variance)
+    return float(-0.5 * np.sum(each))

@@ -1,0 +1,143 @@
+"""Ranges that others state: errors they share are found, outliers do no harm, and the deviation told stays true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from locate.made_epochs import HALL, Drive, make_epoch, make_site
+from sonofix.flow import Street
+from sonofix.records import Floats
+from sonofix.track import stated
+from sonofix.track.update import GATE_SIGMA
+
+SITE = make_site(HALL)
+PAIRS = tuple((b.id, m.id) for b in SITE.beacons for m in SITE.microphones)
+COUNT, PERIOD_S, SD_M = 240, 0.25, 0.05
+
+
+def circle(time_s: float) -> tuple[float, float, float]:
+    return 5.0 + 2.5 * np.sin(0.3 * time_s), 4.0 - 2.0 * np.cos(0.3 * time_s), 1.1
+
+
+def walked(
+    errors_m: Floats, rng: np.random.Generator, claimed_m: float = SD_M
+) -> tuple[Street, Floats, Floats, Floats]:
+    """Drive round and round with so much (epochs, pairs) added to ranges.
+
+    Returns the street, misses (n, 3, 2) of the track, its deviations, and of each epoch's fix; NaN where there is none.
+    """
+    street, told = Street(SITE), np.full((COUNT, 3, 2), np.nan)
+    street.sense({}, stated=PAIRS)
+    for k in range(COUNT):
+        time_s = PERIOD_S * k + 0.05
+        epoch = make_epoch(SITE, Drive(circle(time_s)), sd_m=SD_M, rng=rng, stated=True)
+        heard = replace(
+            epoch,
+            time_s=np.full(len(PAIRS), time_s),
+            sync_s=time_s,
+            range_m=epoch.range_m + errors_m[k],
+            covariance_m2=claimed_m**2 * np.eye(len(PAIRS)),
+        )
+        step = street.walk(heard)
+        for got in step.estimates:
+            told[k, 0] = (got.position_m - circle(time_s))[:2]
+            told[k, 1] = np.sqrt(np.diag(got.covariance)[:2])
+        for found in step.fixes:
+            if found.position_m is not None:
+                told[k, 2] = (found.position_m - circle(time_s))[:2]
+    return street, told[:, 0], told[:, 1], told[:, 2]
+
+
+def rms(miss: Floats) -> float:
+    return float(np.sqrt(np.nanmean(np.sum(miss**2, axis=1))))
+
+
+def honest(miss: Floats, sd: Floats) -> bool:
+    return bool(np.mean(np.all(np.abs(miss) < 2 * sd, axis=1)) > 0.75)
+
+
+def test_the_bias_of_each_pair_is_found_while_driving(rng: np.random.Generator) -> None:
+    bias = np.array([0.25, -0.1, 0.1, 0.0, 0.2, 0.15])
+    street, miss, sd, fixed = walked(np.tile(bias, (COUNT, 1)), rng)
+    belief = street.follower.belief
+    assert belief.inputs is not None
+    slot = belief.inputs.range_slot
+    at = stated.places(slot, np.arange(6), 6)[0]
+    # ranges of about 6 m hardly tell a scale from a bias that all share: what both make of them is what is known
+    weigh = np.zeros((6, len(belief.mean)))
+    weigh[:, slot], weigh[:, slot + 1], weigh[np.arange(6), at] = 6.0, 1.0, 1.0
+    found, told = weigh @ belief.mean, np.sqrt(np.diag(weigh @ belief.covariance @ weigh.T))
+    assert np.all(np.abs(found - bias) < 4 * told + 0.05)
+    assert rms(miss[120:]) < 0.7 * rms(fixed[120:])
+    assert honest(miss[120:], sd[120:])
+
+
+def test_outliers_of_many_metres_do_no_harm(rng: np.random.Generator) -> None:
+    late = np.where(rng.random((COUNT, 6)) < 0.1, rng.uniform(2.0, 15.0, (COUNT, 6)), 0.0)
+    _, clean, _, _ = walked(np.zeros((COUNT, 6)), np.random.default_rng(5))
+    _, miss, _, _ = walked(late, np.random.default_rng(5))
+    # a tenth of the ranges is gone: 5 % of deviation; the rest is what learning noise costs
+    assert rms(miss[60:]) < 1.5 * rms(clean[60:])
+
+
+def test_a_bias_that_all_share_is_found(rng: np.random.Generator) -> None:
+    _, miss, sd, fixed = walked(np.full((COUNT, 6), 0.3), rng)
+    assert rms(miss[120:]) < 0.7 * rms(fixed[120:])
+    assert honest(miss[120:], sd[120:])
+
+
+def test_noise_is_learnt_where_ranges_claim_too_little(rng: np.random.Generator) -> None:
+    # whether an error of one range is noise or passes within two seconds is hardly told; how large it is, is
+    street, miss, sd, _ = walked(np.zeros((COUNT, 6)), rng, claimed_m=0.02)
+    trust = street.follower.belief.trust
+    assert trust is not None
+    learnt_m2 = trust.extra(np.arange(6)) + trust.variance[1]
+    assert 0.5 * SD_M**2 < learnt_m2.mean() < 4 * SD_M**2
+    assert honest(miss[60:], sd[60:])
+
+
+def test_errors_that_last_seconds_are_taken_as_such(rng: np.random.Generator) -> None:
+    # multipath of 0.2 m, correlated over 2 s: white noise of that size would be averaged away far too soon
+    fade = np.exp(-PERIOD_S / 2.0)
+    error = np.zeros((COUNT, 6))
+    for k in range(1, COUNT):
+        error[k] = fade * error[k - 1] + 0.2 * np.sqrt(1 - fade**2) * rng.standard_normal(6)
+    _, miss, sd, _ = walked(error, rng)
+    assert honest(miss[60:], sd[60:])
+
+
+def test_whom_nothing_moves_is_followed_calmly(rng: np.random.Generator) -> None:
+    street = Street(SITE)
+    street.sense({}, stated=PAIRS)
+    free = street.follower.motion.acceleration_psd
+    for k in range(150):
+        epoch = make_epoch(SITE, Drive((3.0, 5.0, 1.1)), PERIOD_S * k, sd_m=0.2, rng=rng, stated=True)
+        street.walk(epoch)
+    assert street.follower.motion.acceleration_psd < free / 5
+
+
+def test_the_tail_of_noise_weighs_less_and_less() -> None:
+    surprise = np.linspace(0.0, GATE_SIGMA**2, 50)
+    factor = stated.heavier(surprise)
+    assert np.all(factor >= 1.0)
+    pull = np.sqrt(surprise) / factor
+    assert np.argmax(pull) < 45
+    # the factor is that of the t density's score: d/dz log p = -z (ν + 1) / (ν + z²)
+    beyond = surprise > 1.0
+    assert factor[beyond] == pytest.approx((stated.FREEDOM + surprise[beyond]) / (stated.FREEDOM + 1.0))
+
+
+def test_errors_age_to_what_is_known_of_their_variance() -> None:
+    known = stated.trust(3)
+    n = stated.size(3)
+    mean, covariance, free = np.zeros(n), np.zeros((n, n)), np.zeros(n, bool)
+    stated.begin(mean, covariance, free, 0, 3)
+    mean[stated.COMMON :] = 1.0
+    covariance[stated.COMMON :, stated.COMMON :] *= 0.1
+    stated.wander(mean, covariance, 0, known, 1e6)
+    assert mean[stated.COMMON :] == pytest.approx(0.0)
+    assert np.diag(covariance)[stated.COMMON :] == pytest.approx(stated.BEGIN_SD_M**2)
+    assert free.all()
