@@ -90,7 +90,7 @@ def _expected(
 ) -> tuple[Floats, Floats]:
     """Return what rows would show at a mean, and its derivative; ranges stated by others with errors of their own."""
     clock, rates = epoch.clock == "common", epoch.range_rate_mps is not None
-    shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates)
+    shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates, not belief.upright)
     if stated and belief.inputs is not None and belief.inputs.range_slot >= 0:
         slot, n = belief.inputs.range_slot, len(dt)
         derivative *= 1.0 + mean[slot]
