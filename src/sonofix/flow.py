@@ -70,7 +70,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
         yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
     elif recording.ranges is not None:
         street = Street(recording.site, recording.tables.get("start"), rate_hz)
-        street.sense(recording.tables, tuple(zip(recording.ranges.emitter, recording.ranges.receiver, strict=True)))
+        street.sense(recording.tables, recording.ranges.pairs)
         for epoch in stated_epochs(recording.ranges, recording.site):
             yield street.walk(epoch)
     else:
@@ -152,7 +152,8 @@ def _lagging(recording: Recording, steps: Iterable[Step], rate_hz: float | None,
 def _beginning(recording: Recording, time_s: float) -> Follower:
     """Return a follower of a recording as `run` begins with one at the first epoch."""
     street = Street(recording.site, recording.tables.get("start"))
-    street.sense(recording.tables, stated=recording.blocks is None or recording.rate_hz is None)
+    heard = recording.blocks is not None and recording.rate_hz is not None
+    street.sense(recording.tables, None if heard or recording.ranges is None else recording.ranges.pairs)
     street.begin(time_s)
     return street.follower
 

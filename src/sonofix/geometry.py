@@ -209,15 +209,18 @@ def link(site: Site, emitters: tuple[str, ...], receivers: tuple[str, ...]) -> L
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _place(vehicle, point, state, dt, out):
+def _place(vehicle, point, state, dt, tilts, out):
     """Place, velocity, and their derivatives by yaw, roll and pitch of one end of a row: ``out`` (8, 3).
 
-    Rows 2 to 4 are those of the place, and of the velocity by the angles' rates; 5 to 7 those of the velocity.
+    Rows 2 to 4 are those of the place, and of the velocity by the angles' rates; 5 to 7 those of the velocity. Those
+    by roll and pitch are left alone unless it ``tilts``.
     """
     for axis in range(3):
         out[0, axis] = point[axis]
-        for row in range(1, 8):
-            out[row, axis] = 0.0
+        out[1, axis] = out[2, axis] = out[5, axis] = 0.0
+    if tilts:
+        out[3:5] = 0.0
+        out[6:8] = 0.0
     if vehicle < 0:
         return
     at = SIZE * vehicle
@@ -225,7 +228,21 @@ def _place(vehicle, point, state, dt, out):
         out[0, axis] = state[at + axis] + state[at + 4 + axis] * dt
         out[1, axis] = state[at + 4 + axis]
     forward, left, up = point[0], point[1], point[2]
-    if forward == 0.0 and left == 0.0 and up == 0.0:
+    if forward == 0.0 and left == 0.0 and (up == 0.0 or not tilts):
+        out[0, 2] += up
+        return
+    if not tilts:
+        yaw_rate = state[at + YAW_RATE]
+        yaw = state[at + YAW] + yaw_rate * dt
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        east, north = cos * forward - sin * left, sin * forward + cos * left
+        out[0, 0] += east
+        out[0, 1] += north
+        out[0, 2] += up
+        out[2, 0], out[2, 1] = -north, east
+        out[1, 0] -= yaw_rate * north
+        out[1, 1] += yaw_rate * east
+        out[5, 0], out[5, 1] = -yaw_rate * east, -yaw_rate * north
         return
     yaw_rate, roll_rate, pitch_rate = state[at + YAW_RATE], state[at + ROLL_RATE], state[at + PITCH_RATE]
     yaw = state[at + YAW] + yaw_rate * dt
@@ -274,7 +291,7 @@ def _turn(rate, x, y, z, arm, out):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def expected(ends, state, dt, c, clock, value, derivative):
+def expected(ends, state, dt, c, clock, tilts, value, derivative):
     """What rows would show at a state, and its derivative: the kernel that `model`, fixes and tracks share.
 
     Kernels that call this keep a copy of it in their own cache, which does not notice a change here.
@@ -289,6 +306,8 @@ def expected(ends, state, dt, c, clock, value, derivative):
         When each row was heard, from the instant the state belongs to.
     c : float
         Sound speed.
+    tilts : bool
+        Whether roll and pitch count; else vehicles stand upright, and derivatives by these are 0.
     value : float64 (m,), out
         Ranges and then, where it is m = 2 n long, range rates.
     derivative : float64 (m, SIZE V + 2), out
@@ -300,11 +319,11 @@ def expected(ends, state, dt, c, clock, value, derivative):
     rates = len(value) > n
     derivative[:] = 0.0
     for i in range(n):
-        _place(receiver_vehicle[i], receiver_point[i], state, dt[i], here)
+        _place(receiver_vehicle[i], receiver_point[i], state, dt[i], tilts, here)
         sent = dt[i]
         distance = 0.0
         for _ in range(4):  # contracts by v/c each time: 1e-9 of the range at 3 m/s
-            _place(emitter_vehicle[i], emitter_point[i], state, sent, there)
+            _place(emitter_vehicle[i], emitter_point[i], state, sent, tilts, there)
             distance = 0.0
             for axis in range(3):
                 distance += (here[0, axis] - there[0, axis]) ** 2
@@ -347,7 +366,7 @@ def expected(ends, state, dt, c, clock, value, derivative):
                 if rates:
                     derivative[n + i, at + axis] += k * across[axis]
                     derivative[n + i, at + 4 + axis] += k * (unit[axis] + when * across[axis])
-            for angle in range(3):
+            for angle in range(3 if tilts else 1):
                 by, by_rate = at + YAW, at + YAW_RATE
                 if angle > 0:
                     by, by_rate = at + ROLL + angle - 1, at + ROLL_RATE + angle - 1
@@ -364,12 +383,12 @@ def expected(ends, state, dt, c, clock, value, derivative):
 
 
 def rows_at(
-    links: Links, state: Floats, dt: Floats, sound_speed_mps: float, clock: bool, rates: bool
+    links: Links, state: Floats, dt: Floats, sound_speed_mps: float, clock: bool, rates: bool, tilts: bool = True
 ) -> tuple[Floats, Floats]:
     """Run `expected` into new arrays: what rows would show (m,) and its derivative (m, SIZE V + 2)."""
     m = len(dt) * (2 if rates else 1)
     value, derivative = np.empty(m), np.empty((m, len(state)))
-    expected(links.ends, state, dt, float(sound_speed_mps), clock, value, derivative)
+    expected(links.ends, state, dt, float(sound_speed_mps), clock, tilts, value, derivative)
     return value, derivative
 
 

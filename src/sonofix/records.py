@@ -71,6 +71,11 @@ class RangeRows:
     sd_m: Floats | None
     speed_sd_mps: float = 0.0
 
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Emitter and receiver of each row."""
+        return tuple(zip(self.emitter, self.receiver, strict=True))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:

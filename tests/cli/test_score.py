@@ -99,3 +99,23 @@ def test_a_track_before_the_truth_has_no_figures(folder):
     found = json.loads(runner.invoke(app, ["score", str(folder), "--json"]).stdout)
     assert found["track"] == {}
     assert found["ranges"]["every"]["count"] == 1
+
+
+def test_roll_and_pitch_are_judged_where_truth_and_track_have_them(folder):
+    (folder / "truth.csv").write_text(
+        "time_s,x_m,y_m,z_m,yaw_rad,roll_rad,pitch_rad\n0,3,4,0,0.5,0.1,0\n10,3,4,0,0.5,0.1,0\n"
+    )
+    assert "roll_rad" not in runner.invoke(app, ["score", str(folder)]).stdout
+    (folder / "out" / "track.csv").write_text(
+        "time_s,vehicle,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,yaw_rad,sd_x_m,sd_y_m,sd_z_m,sd_yaw_rad,source,"
+        "roll_rad,pitch_rad,sd_roll_rad,sd_pitch_rad\n"
+        "1.0,agv,3.02,4.0,0.0,0.1,0.0,0.0,0.52,0.02,0.02,,0.02,fused,0.13,-0.01,0.03,0.02\n"
+    )
+    track = json.loads(runner.invoke(app, ["score", str(folder), "--json"]).stdout)["track"]["agv"]
+    assert track["rmse_roll_rad"] == pytest.approx(0.03)
+    assert track["rmse_pitch_rad"] == pytest.approx(0.01)
+    # each angle's square over its variance: 1 + 0.25 + 1
+    assert track["nees_attitude"] == pytest.approx(2.25)
+    table = runner.invoke(app, ["score", str(folder)]).stdout
+    for words in ("roll error, rms", "pitch error, rms", "1.72 °", "0.57 °", "3 is right"):
+        assert words in table

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -258,3 +259,19 @@ def test_a_folder_that_may_not_be_written(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(RecordingError, match="cannot be written"):
         write_run(tmp_path / "out", [], SITE)
+
+
+def test_a_body_that_tilts_has_its_roll_and_pitch_behind_all_else(tmp_path):
+    vehicle = SITE.vehicles[0].model_copy(update={"tilt_sd_rad": 0.2})
+    tilting = SITE.model_copy(update={"vehicles": (vehicle,)})
+    covariance = np.diag([1e-4, 1e-4, 4e-4, 9e-4])
+    leaning = replace(
+        estimate(0.2), states=("x", "y", "roll", "pitch"), covariance=covariance, roll_rad=0.25, pitch_rad=-0.125
+    )
+    write_run(tmp_path, [step(0, estimates=(leaning,))], tilting)
+    (row,) = rows(tmp_path / "track.csv")
+    assert list(row)[-5:] == ["source", "roll_rad", "pitch_rad", "sd_roll_rad", "sd_pitch_rad"]
+    assert [float(row[name]) for name in list(row)[-4:]] == pytest.approx([0.25, -0.125, 0.02, 0.03])
+    (row,) = rows(tmp_path / "fixes.csv")
+    assert list(row)[-5:] == ["excluded", "roll_rad", "pitch_rad", "sd_roll_rad", "sd_pitch_rad"]
+    assert list(row.values())[-4:] == ["", "", "", ""]

@@ -53,13 +53,13 @@ def test_a_step_is_the_textbook_update_by_numerical_derivatives(rng: np.random.G
         h = approx_fprime(mean, disagreement, 1e-7)
         s = h @ covariance @ h.T + steps.STEP_SD_M**2 * np.eye(2)
         gain = covariance @ h.T @ np.linalg.inv(s)
-        wanted = mean - gain @ disagreement(mean), (np.eye(14) - gain @ h) @ covariance
+        wanted = mean - gain @ disagreement(mean), (np.eye(SIZE + 6) - gain @ h) @ covariance
         if disagreement(mean) @ np.linalg.solve(s, disagreement(mean)) > steps.UNLIKELY:
             wanted = mean, covariance
         got, after = mean.copy(), covariance.copy()
-        steps.take(got, after, np.ones(14, bool), 0, SLOT, length, heading)
+        steps.take(got, after, np.ones(SIZE + 6, bool), 0, SLOT, length, heading)
         np.testing.assert_allclose(got[:8], wanted[0][:8], atol=1e-6)
-        np.testing.assert_allclose(got[10:], wanted[0][10:], atol=1e-6)
+        np.testing.assert_allclose(got[SLOT + 2 :], wanted[0][SLOT + 2 :], atol=1e-6)
         np.testing.assert_allclose(after[:8, :8], wanted[1][:8, :8], atol=1e-6)
         # the anchor is where the step ended: the same place, with the same certainty
         np.testing.assert_array_equal(got[SLOT + AT], got[AT])
@@ -67,7 +67,7 @@ def test_a_step_is_the_textbook_update_by_numerical_derivatives(rng: np.random.G
 
 
 def test_step_errors_forget_themselves_in_their_correlation_time() -> None:
-    mean, covariance, free = np.zeros(14), np.zeros((14, 14)), np.zeros(14, bool)
+    mean, covariance, free = np.zeros(SIZE + 6), np.zeros((SIZE + 6, SIZE + 6)), np.zeros(SIZE + 6, bool)
     steps.begin(covariance, free, SLOT)
     np.testing.assert_array_equal(np.flatnonzero(free), [SLOT + 2, SLOT + 3])
     mean[SLOT + 2 : SLOT + 4], stationary = [0.1, 0.05], covariance.copy()

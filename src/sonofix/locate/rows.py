@@ -14,7 +14,7 @@ from sonofix.locate.dense import spread, whitener
 from sonofix.locate.integrity import RISK, levels, threshold
 from sonofix.locate.noise import CLOCK_SPEED_SD, row_noise
 from sonofix.locate.search import MOST, rivals, search, without
-from sonofix.locate.solve import misfit
+from sonofix.locate.solve import beforehand, misfit
 from sonofix.ranging import flights_m
 from sonofix.records import Floats, RangeEpoch
 
@@ -111,7 +111,7 @@ def look(rows, c, clock, index, state, kept, residual):
     ends, dt, measured = rows
     n, places, in_space = len(dt), 0, False
     value, derivative = np.empty(n), np.empty((n, ALONE))
-    expected(ends, state, dt, c, clock, value, derivative)
+    expected(ends, state, dt, c, clock, beforehand(index) > 0, value, derivative)
     for i in range(n):
         residual[i] = measured[i] - value[i]
     chosen = np.empty(len(index), np.int64)

@@ -175,7 +175,7 @@ def _attitudes(rows, c, clock, whiten, place, tilts, out):
     value, derivative = np.empty(n), np.empty((n, ALONE))
     for y in range(YAW_STARTS):
         state[YAW] = y * turn
-        expected(ends, state, dt, c, clock, value, derivative)
+        expected(ends, state, dt, c, clock, tilts, value, derivative)
         misfits[y] = _square(measured, value, whiten)
         if misfits[y] < misfits[best]:
             best = y
@@ -190,7 +190,7 @@ def _attitudes(rows, c, clock, whiten, place, tilts, out):
         for lean in range(LEAN_STARTS if tilts else 0):
             state[YAW] = y * turn
             _lean(lean, state)
-            expected(ends, state, dt, c, clock, value, derivative)
+            expected(ends, state, dt, c, clock, tilts, value, derivative)
             square = _square(measured, value, whiten)
             if square < least:
                 least, out[k, 1], out[k, 2] = square, state[ROLL], state[PITCH]

@@ -52,8 +52,9 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
     ends, dt, measured = rows
     m = len(measured)
     derivative = np.empty((m, ALONE))
-    last = m - beforehand(index)
-    expected(ends, state, dt, c, clock, plain[:last], derivative[:last])
+    known = beforehand(index)
+    last = m - known
+    expected(ends, state, dt, c, clock, known > 0, plain[:last], derivative[:last])
     for j in index:
         if ROLL <= j < SIZE:
             most = UNUSUAL / whiten[last, last]
@@ -82,12 +83,14 @@ def misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian):
 def alike(a, b, place_m, turn_rad):
     """Whether two states are one within so much."""
     square = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
-    same = square < place_m**2
+    if not square < place_m**2:
+        return False
     for j in (YAW, ROLL, PITCH):
         turn = a[j] - b[j]
         turn -= 2 * np.pi * np.floor(turn / (2 * np.pi) + 0.5)
-        same &= abs(turn) < turn_rad
-    return same
+        if not abs(turn) < turn_rad:
+            return False
+    return True
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -97,6 +97,11 @@ class Belief:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
         return 0.0 if self.tilt_sd_rad is None else float(self.tilt_sd_rad[vehicle])
 
+    @property
+    def upright(self) -> bool:
+        """Whether no vehicle tilts."""
+        return self.tilt_sd_rad is None or not self.tilt_sd_rad.any()
+
     def pose(self) -> Floats:
         """Poses (V, SIZE)."""
         return self.mean[: SIZE * len(self.placed)].reshape(-1, SIZE)

@@ -371,6 +371,7 @@ def expectations(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Range, its deviation, range rate and its deviation that a belief expects of emitter–receiver pairs, each (n,)."""
     n, links = len(pairs), link(site, tuple(p[0] for p in pairs), tuple(p[1] for p in pairs))
-    shown, derivative = rows_at(links, belief.mean, np.zeros(n), sound_speed_mps, clock=False, rates=True)
+    zeros, tilts = np.zeros(n), not belief.upright
+    shown, derivative = rows_at(links, belief.mean, zeros, sound_speed_mps, clock=False, rates=True, tilts=tilts)
     sd = np.sqrt(np.maximum(np.einsum("ij,ij->i", derivative @ belief.covariance, derivative), 0.0))
     return shown[:n], np.hypot(sd[:n], links.emitter_sd_m), shown[n:], sd[n:]

@@ -129,7 +129,7 @@ def expect(
 ) -> tuple[Floats, Floats]:
     """Return what rows would show at a mean, and its derivative; ranges stated by others with errors of their own."""
     clock, rates = epoch.clock == "common", epoch.range_rate_mps is not None
-    shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates)
+    shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates, not belief.upright)
     if belief.inputs is None or not len(pair):
         return shown, derivative
     return stated.show(mean, belief.inputs.range_slot, pair, len(belief.inputs.pairs), shown, derivative)
