@@ -120,7 +120,7 @@ def bare(belief: Belief) -> Belief:
 
 
 def follows(belief: Belief, rival: Belief) -> Belief:
-    """Return a rival's belief in a belief's place, with its copies of earlier states; those tell nothing of the rival."""
+    """Return a rival's belief in a belief's place, with copies of earlier states that then tell nothing of it."""
     own, n = _own(belief), len(belief.mean)
     mean, covariance, free = belief.mean.copy(), np.zeros((n, n)), np.zeros(n, bool)
     copies = np.setdiff1d(np.arange(n), own)
