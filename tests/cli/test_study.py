@@ -46,6 +46,15 @@ def test_table_picture_curves_and_findings(tmp_path: Path) -> None:
     assert (out / "study.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_part_is_chosen_and_one_that_is_none_is_told(tmp_path: Path) -> None:
+    ask("robots", "--part", "collision", "--runs", 2, "--waveforms", 0, "-o", tmp_path / "c", "--no-plot")
+    content = json.loads((tmp_path / "c" / "findings.json").read_text("utf-8"))
+    assert (content["study"], content["part"]) == ("robots", "collision")
+    told = CliRunner().invoke(app, ["study", "robots", "--part", "leap"])
+    assert told.exit_code == 2
+    assert told.stderr.strip() == "study robots, part leap: there is none of that name; choose of detection, collision"
+
+
 def test_same_seed_same_numbers_and_no_picture_where_none_is_wanted(tmp_path: Path) -> None:
     first, again, other = (
         ask("quasi-gps", "--runs", 5, "--waveforms", 0, "--seed", seed, "-o", tmp_path / str(i), "--no-plot")
@@ -109,7 +118,7 @@ def test_a_stop_before_anything_is_told(tmp_path: Path, monkeypatch: pytest.Monk
 def test_mistakes_are_lines(tmp_path: Path) -> None:
     told = CliRunner().invoke(app, ["study", "robot"])
     assert told.exit_code == 2
-    assert told.stderr.strip() == "study robot: there is none of that name; there are quasi-gps, pedestrian"
+    assert told.stderr.strip() == "study robot: there is none of that name; there are quasi-gps, pedestrian, robots"
     (tmp_path / "site.toml").write_text("")
     told = CliRunner().invoke(app, ["study", "quasi-gps", "-o", str(tmp_path)])
     assert told.exit_code == 2
@@ -125,6 +134,8 @@ def test_mistakes_are_lines(tmp_path: Path) -> None:
         (0.14089, 0.00068, "m/s", "14.089 ± 0.068 cm/s"),
         (0.997, 0.00018, "", "99.700 ± 0.018 %"),
         (0.0, 0.0, "m", "0.0 mm"),
+        (4.9536, 0.0021, "V", "4.9536 ± 0.0021 V"),
+        (2.049, 0.048, "1", "2.049 ± 0.048"),
     ],
 )
 def test_figures_read_well(value: float, sd: float | None, unit: str, text: str) -> None:

@@ -112,7 +112,7 @@ def test_nothing_finished_is_no_sheet_and_a_part_is_one() -> None:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (("robot", 1, 0, 0), "study robot: there is none of that name; there are quasi-gps, pedestrian"),
+        (("robot", 1, 0, 0), "study robot: there is none of that name; there are quasi-gps, pedestrian, robots"),
         (("quasi-gps", 0, 0, 0), "runs 0: it must be 1 or more"),
         (("quasi-gps", 1, 0, -1), "waveforms -1: it must be 0 or more"),
     ],

@@ -17,7 +17,10 @@ OUTPUTS = ("study.png", "curves.csv", "findings.json")
 
 
 def study(
-    name: Annotated[str, typer.Argument(help="quasi-gps or pedestrian.")],
+    name: Annotated[str, typer.Argument(help="quasi-gps, pedestrian or robots.")],
+    part: Annotated[
+        str | None, typer.Option(help="Of robots: detection (the default) or collision.", show_default=False)
+    ] = None,
     runs: Annotated[int, typer.Option(help="Runs on the paper's numbers.", min=1, max=100_000)] = 300,
     waveforms: Annotated[
         int, typer.Option(help="Runs from waveforms through the receiver, some ten seconds each; 0: none.", min=0)
@@ -33,17 +36,22 @@ def study(
     \b
     quasi-gps   a vehicle's coarse fixes and velocities, and the paper's four-state filter
     pedestrian  a walker's fixes by arrival-time differences, steps, and the paper's error-state filter
+    robots      three robots: a burst picked out of noise (--part detection), a collision repaired (--part collision)
 
     Each figure comes with its standard error over the runs. Ctrl-C keeps the runs that are finished. For example:
 
     sonofix study quasi-gps -o quasi-gps
 
     sonofix study pedestrian --runs 1000 --waveforms 0
+
+    sonofix study robots --part collision -o collision
     """
     from sonofix.files.writing import results_folder
-    from sonofix.studies import begin
+    from sonofix.studies import PARTS, begin
 
-    work = begin(name, runs, seed, waveforms)
+    if part is None and name in PARTS:
+        part = PARTS[name][0]
+    work = begin(name, runs, seed, waveforms, part)
     if out is not None:
         results_folder(out)
     stopped = not _finished(work)
@@ -52,7 +60,7 @@ def study(
         raise Stopped("stopped; no run was finished")
     _tell(sheet)
     if out is not None:
-        _write(out, name, seed, sheet)
+        _write(out, name, part, seed, sheet)
         if plot:
             _draw(out / "study.png", sheet)
         speaker().print(f"\nWritten to {out}")
@@ -92,15 +100,16 @@ def found_text(finding: Finding) -> str:
         "m": (1e3, "mm") if size < 0.01 else (1e2, "cm") if size < 1 else (1.0, "m"),
         "m/s": (1e3, "mm/s") if size < 0.005 else (1e2, "cm/s"),
         "": (1e2, "%"),
+        "1": (1.0, ""),
     }.get(finding.unit, (1.0, finding.unit))
     value, sd = factor * finding.value, factor * (finding.sd or 0.0)
     scale = sd or abs(value) / 10 or 1.0
     digits = min(max(1 - floor(log10(scale)), 0), 4)
     doubt = f" ± {sd:.{digits}f}" if finding.sd else ""
-    return f"{value:.{digits}f}{doubt} {unit}"
+    return f"{value:.{digits}f}{doubt} {unit}".rstrip()
 
 
-def _write(out: Path, name: str, seed: int, sheet: Sheet) -> None:
+def _write(out: Path, name: str, part: str | None, seed: int, sheet: Sheet) -> None:
     """Write what is drawn as a table, a row a point, and the figures found in SI units."""
     import csv
     import io
@@ -119,7 +128,7 @@ def _write(out: Path, name: str, seed: int, sheet: Sheet) -> None:
                 rows.writerow((title, curve.name, *("" if v != v else f"{v:.9g}" for v in (x, y))))
     write_text(out / "curves.csv", text.getvalue())
     findings = [asdict(finding) for finding in sheet.findings]
-    content = {"study": name, "seed": seed, "findings": findings}
+    content = {"study": name} | ({"part": part} if part else {}) | {"seed": seed, "findings": findings}
     write_text(out / "findings.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
     with told(out, "study.png"):
         (out / "study.png").unlink(missing_ok=True)

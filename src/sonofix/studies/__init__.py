@@ -10,11 +10,15 @@ from sonofix.studies.work import Work
 STUDIES = {
     "quasi-gps": "an automatic vehicle: coarse fixes and velocities, and the four-state filter",
     "pedestrian": "a walker: differences of arrival times, dead reckoning by steps, and the error-state filter",
+    "robots": "three robots: bursts picked out of noise by adaptive filters, and a collision repaired by fellows",
 }
 """Names of the studies and what they are about. Each has a module of its name with a `study` of its own."""
 
+PARTS = {"robots": ("detection", "collision")}
+"""Studies of several parts, of which one is done at a time."""
 
-def begin(name: str, runs: int, seed: int, waveforms: int) -> Work:
+
+def begin(name: str, runs: int, seed: int, waveforms: int, part: str | None = None) -> Work:
     """Set a study up; nothing is computed yet.
 
     Parameters
@@ -27,16 +31,22 @@ def begin(name: str, runs: int, seed: int, waveforms: int) -> Work:
         Same seed, same numbers: run k is the same however many there are.
     waveforms : int
         Runs from waveforms through the receiver, 0 or more.
+    part : str or None
+        Of a study that has `PARTS`.
 
     Raises
     ------
     ValueError
-        For another name, or counts out of reach.
+        For another name or part, or counts out of reach.
     """
     if name not in STUDIES:
         raise ValueError(f"study {name}: there is none of that name; there are {', '.join(STUDIES)}")
     for what, value, least in (("runs", runs, 1), ("seed", seed, 0), ("waveforms", waveforms, 0)):
         if value < least:
             raise ValueError(f"{what} {value}: it must be {least} or more")
-    study: Callable[[int, int, int], Work] = import_module(f"sonofix.studies.{name.replace('-', '_')}").study
-    return study(runs, seed, waveforms)
+    parts = PARTS.get(name, ())
+    if part not in (parts or (None,)):
+        told = f"choose of {', '.join(parts)}" if parts else "it is of one piece: leave the part out"
+        raise ValueError(f"study {name}, part {part}: there is none of that name; {told}")
+    study: Callable[..., Work] = import_module(f"sonofix.studies.{name.replace('-', '_')}").study
+    return study(runs, seed, waveforms, part) if parts else study(runs, seed, waveforms)
