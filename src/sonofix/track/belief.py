@@ -12,9 +12,9 @@ from sonofix.geometry import PITCH, POSE, ROLL, SIZE, YAW, from_arm, open_arms, 
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
-from sonofix.track import stated, steps, wheels
+from sonofix.track import gyro, stated, steps, wheels
 from sonofix.track.anchor import lift
-from sonofix.track.inputs import STEP, WHEELS, Inputs
+from sonofix.track.inputs import GYRO, STEP, WHEELS, Inputs
 from sonofix.track.stated import Trust
 from sonofix.track.tilt import open_tilt, rock
 
@@ -129,7 +129,7 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
     for i, vehicle in enumerate(site.vehicles):
         mean[SIZE * i + 2] = vehicle.z_m or 0.0
     if inputs is not None:
-        for room, slots in ((steps, inputs.step_slot), (wheels, inputs.wheel_slot)):
+        for room, slots in ((steps, inputs.step_slot), (wheels, inputs.wheel_slot), (gyro, inputs.gyro_slot)):
             for slot in slots[slots >= 0]:
                 room.begin(covariance, free, int(slot))
         if inputs.range_slot >= 0:
@@ -197,6 +197,8 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
                 steps.wander(mean, covariance, vehicle, step, until_s - now_s, bool(belief.placed[vehicle]))
             if wheel >= 0:
                 wheels.wander(covariance, free, vehicle, wheel, until_s - now_s)
+            if inputs.gyro_slot[vehicle] >= 0:
+                gyro.wander(covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), until_s - now_s)
         if belief.trust is not None:
             stated.wander(mean, covariance, inputs.range_slot, belief.trust, until_s - now_s)
         if row is not None and belief.placed[inputs.vehicle[row]]:
@@ -224,6 +226,8 @@ def _sense(
     elif inputs.kind[row] == WHEELS:
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
         wheels.take(mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about)
+    elif inputs.kind[row] == GYRO:
+        gyro.take(mean, covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), first, second)
     else:
         wheels.point(mean, covariance, free, vehicle, first)
 
@@ -259,6 +263,7 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
     if belief.inputs is not None:
         lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
         lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
+        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
     index = [names[state] for state in fix.states]
     covariance[np.ix_(index, index)] = fix.covariance
     free[index] = True
@@ -318,6 +323,7 @@ def reopen(belief: Belief, vehicle: int, far_m: float) -> Belief:
     if belief.inputs is not None:
         lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
         lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
+        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
     return replace(belief, mean=mean, covariance=covariance, free=free)
 
 

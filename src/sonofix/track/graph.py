@@ -65,6 +65,9 @@ def smooth(
         raise ModuleNotFoundError(MISSING, name=error.name) from error
     if begin().free_running:
         raise ValueError("a graph needs a clock that goes on from epoch to epoch; use --smooth without --graph here")
+    inputs = begin().belief.inputs
+    if inputs is not None and np.any(inputs.gyro_slot >= 0):
+        raise ValueError("a graph knows nothing of a gyro (imu.csv); use --smooth without --graph here")
     passage = settle(begin, heard, rate_hz, passes, on_epoch, rows=True)
     if not passage.marks:
         return [() for _ in heard]

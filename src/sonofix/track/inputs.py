@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import SIZE, open_arms
+from sonofix.geometry import SIZE, open_arms, tilting
 from sonofix.records import Floats, Table
 from sonofix.site import Site
 from sonofix.track import stated as others
+from sonofix.track.gyro import summed
 from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
 
 STEP_STATES = ("anchor_x", "anchor_y", "length", "heading")
@@ -22,7 +23,10 @@ WHEEL_STATES = ("anchor_x", "anchor_y", "anchor_yaw", "scale", "bias")
 """What odometry adds: the pose at its row before, by what share of itself its speed is told too high, and its yaw rate
 at rest."""
 
-STEP, WHEELS, COMPASS = range(3)
+GYRO_STATES = ("anchor_yaw", "gyro_bias")
+"""What a gyro adds: the heading where its row before ended, and the rate that it tells at rest."""
+
+STEP, WHEELS, COMPASS, GYRO = range(4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,12 +38,14 @@ class Inputs:
     time_s : float64 (k,)
         When each row is known: a step at its end, a row of odometry when the next one comes.
     kind, vehicle : int (k,)
-        `STEP`, `WHEELS` or `COMPASS`; index of the vehicle it speaks of.
+        `STEP`, `WHEELS`, `COMPASS` or `GYRO`; index of the vehicle it speaks of.
     value : float64 (k, 4)
         Length and heading of a step; way, turn and time of an arc by odometry, and what may have been turned unseen at
-        its end; heading of a compass. NaN where unknown.
+        its end; heading of a compass; turn by a gyro and its time. NaN where unknown.
     step_slot, wheel_slot : int (V,)
         Where each vehicle's `STEP_STATES` and `WHEEL_STATES` stand in a belief; −1: it has none.
+    gyro_slot : int (V,)
+        The same of `GYRO_STATES`.
     headed : bool (V,)
         Vehicles whose heading something tells.
     arm : float64 (V, 2)
@@ -58,6 +64,7 @@ class Inputs:
     value: Floats
     step_slot: NDArray[np.int64]
     wheel_slot: NDArray[np.int64]
+    gyro_slot: NDArray[np.int64]
     headed: NDArray[np.bool_]
     arm: Floats
     range_slot: int
@@ -81,14 +88,14 @@ def reckoned(inputs: Inputs, vehicle: int, until_s: float) -> Floats:
 
 
 def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, str]] | None = None) -> Inputs | None:
-    """Bring the tables that the track uses (`steps`, `odometry`, `compass`) into one order of time.
+    """Bring the tables that the track uses (`steps`, `odometry`, `compass`, `imu`) into one order.
 
     A row with an empty cell tells nothing but its time. ``stated``: the pairs (emitter, receiver) whose ranges come
     from others, with errors of their own; None where ranges are our own. None where there is neither.
     """
-    ids = [v.id for v in site.vehicles]
+    ids, tilts = [v.id for v in site.vehicles], tilting(site) > 0
     parts: list[tuple[Floats, NDArray[np.int64], NDArray[np.int64], Floats]] = []
-    for kind, stem in ((STEP, "steps"), (WHEELS, "odometry"), (COMPASS, "compass")):
+    for kind, stem in ((STEP, "steps"), (WHEELS, "odometry"), (COMPASS, "compass"), (GYRO, "imu")):
         table = tables.get(stem)
         if table is None or not ids or not len(table.columns["time_s"]):
             continue
@@ -97,9 +104,10 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
         for i, name in enumerate(ids):
             rows = np.array([w == name for w in whose])
             own = {column: values[rows] for column, values in table.columns.items()}
-            if rows.any():
-                count = np.count_nonzero(rows)
-                parts.append((own["time_s"], np.full(count, kind), np.full(count, i), _values(kind, own)))
+            # of a body that tilts the upward axis does not tell its heading's turns alone
+            if rows.any() and not (kind == GYRO and tilts[i]):
+                times_s, values = _values(kind, own)
+                parts.append((times_s, np.full(len(times_s), kind), np.full(len(times_s), i), values))
     if not parts:
         if stated is None:
             return None
@@ -107,25 +115,27 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
         parts.append((np.zeros(0), none, none, np.zeros((0, 4))))
     time_s, kinds, vehicle, value = (np.concatenate(p) for p in zip(*parts, strict=True))
     order = np.argsort(time_s, kind="stable")
-    # only a compass tells what odometry did not see; without one the doubt would stay
-    unaware = (kinds == WHEELS) & ~np.isin(vehicle, vehicle[kinds == COMPASS])
+    # only a compass tells what odometry did not see, if no gyro saw it; without one the doubt would stay
+    asking = np.setdiff1d(vehicle[kinds == COMPASS], vehicle[kinds == GYRO])
+    unaware = (kinds == WHEELS) & ~np.isin(vehicle, asking)
     value[unaware, 3] = 0.0
-    size, slots = 0, np.full((2, len(ids)), -1, np.int64)
-    for kind, states in ((STEP, STEP_STATES), (WHEELS, WHEEL_STATES)):
+    size, slots = 0, np.full((GYRO + 1, len(ids)), -1, np.int64)
+    for kind, states in ((STEP, STEP_STATES), (WHEELS, WHEEL_STATES), (GYRO, GYRO_STATES)):
         for i in np.unique(vehicle[kinds == kind]).tolist():
             slots[kind, i] = SIZE * len(ids) + size
             size += len(states)
     pairs = {pair: i for i, pair in enumerate(dict.fromkeys(stated or ()))}
     range_slot = SIZE * len(ids) + size if stated is not None else -1
     size += others.size(len(pairs)) if stated is not None else 0
-    headed = np.array([bool(np.any((vehicle == i) & (kinds != STEP))) for i in range(len(ids))])
+    headed = np.array([bool(np.any((vehicle == i) & np.isin(kinds, (WHEELS, COMPASS)))) for i in range(len(ids))])
     return Inputs(
         time_s[order],
         kinds[order],
         vehicle[order],
         value[order],
-        slots[0],
-        slots[1],
+        slots[STEP],
+        slots[WHEELS],
+        slots[GYRO],
         headed,
         open_arms(site),
         range_slot,
@@ -134,18 +144,22 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
     )
 
 
-def _values(kind: int, own: Mapping[str, Floats]) -> Floats:
-    """Rows (k, 4) of one vehicle as `Inputs` has them."""
-    out = np.full((len(own["time_s"]), 4), np.nan)
+def _values(kind: int, own: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+    """Times (k,) and rows (k, 4) of one vehicle as `Inputs` has them."""
+    time_s = own["time_s"]
+    if kind == GYRO:
+        time_s, turn, dt = summed(time_s, own["gz_radps"])
+        return time_s, np.column_stack([turn, dt, np.full((len(time_s), 2), np.nan)])
+    out = np.full((len(time_s), 4), np.nan)
     if kind == STEP:
         out[:, 0], out[:, 1] = own["length_m"], own["heading_rad"]
     elif kind == COMPASS:
         out[:, 0] = own["heading_rad"]
     else:
         # each row holds until the next, where it becomes known what was driven
-        dt = np.diff(own["time_s"])
+        dt = np.diff(time_s)
         out[1:, 0], out[1:, 1], out[1:, 2] = own["v_mps"][:-1] * dt, own["yaw_rate_radps"][:-1] * dt, dt
         slow = np.abs(own["v_mps"]) < STANDING_MPS
         out[1:, 3] = np.where(slow[:-1] & ~slow[1:], UNSEEN_RAD, 0.0)
         out[0, 3] = 0.0
-    return out
+    return time_s, out

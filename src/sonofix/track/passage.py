@@ -13,7 +13,7 @@ from sonofix.records import Event, Fix, Floats, RangeEpoch
 from sonofix.track.belief import SIZE, Belief, Nominal, predict
 from sonofix.track.chain import Chain
 from sonofix.track.follow import Follower
-from sonofix.track.inputs import Inputs, reckoned
+from sonofix.track.inputs import GYRO, Inputs, reckoned
 from sonofix.track.wheels import open_heading
 
 Heard = tuple[RangeEpoch, tuple[Fix, ...]]
@@ -126,7 +126,9 @@ class Passage:
         inputs, now_s = self.follower.belief.inputs, self.follower.belief.time_s
         stops: list[tuple[float, Mark]] = []
         if inputs is not None and self._relinearise:
-            rows = [i for i in inputs.within(now_s, until_s) if self.follower.belief.placed[inputs.vehicle[i]]]
+            # a gyro's turns are linear
+            bent = [i for i in inputs.within(now_s, until_s) if inputs.kind[i] != GYRO]
+            rows = [i for i in bent if self.follower.belief.placed[inputs.vehicle[i]]]
             times = inputs.time_s[rows]
             for time_s in np.unique(times).tolist():
                 own = tuple(row for row, t in zip(rows, times, strict=True) if t == time_s)
