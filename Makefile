@@ -25,6 +25,8 @@ prove: $(STAMP)  ## long statistics (many minutes); prints tables and renews doc
 
 bench: $(STAMP)  ## benchmarks against peers and floors in the same run (a quarter of an hour); renews the documents' tables
 	$(BIN)/python benchmarks/street.py --into docs/benchmarks.md
+	$(BIN)/python benchmarks/updates.py --into docs/benchmarks.md
+	$(BIN)/python benchmarks/adaptive.py --into docs/studies.md
 	$(BIN)/python benchmarks/accuracy.py --into README.md
 
 format: $(STAMP)
