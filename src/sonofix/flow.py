@@ -271,7 +271,7 @@ class Street:
             return tuple(fix(asked, self.site, v.id) for v in self.site.vehicles)
 
         epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
-        before = self.follower.belief
+        before, hidden = self.follower.belief, self.follower.hidden
         estimates, used, events = self.follower.step(epoch, fixes)
         believed = used.copy()
         offset = np.full(len(epoch), 0.0 if epoch.clock == "known" else np.nan)
@@ -284,7 +284,7 @@ class Street:
                 if found.clock_offset_m is not None:
                     offset[asked] = found.clock_offset_m
         if self.rate_hz is not None:
-            estimates = self._between(before, estimates)
+            estimates = self._between(before, hidden, estimates)
         return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
 
     def begin(self, time_s: float) -> None:
@@ -303,17 +303,21 @@ class Street:
             yaw = float(np.nan_to_num(start.columns["yaw_rad"][i])) if "yaw_rad" in start.columns else 0.0
             self.follower.start(vehicle, time_s, position, yaw)
 
-    def _between(self, before: Belief, latest: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
+    def _between(self, before: Belief, hidden: frozenset[int], latest: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
         """Return estimates on the grid of the wished rate up to the latest instant, by what was known at each."""
-        if self.rate_hz is None or not latest:
+        if self.rate_hz is None:
             return ()
+        until_s = self.follower.belief.time_s
         if self._written_s is None:
-            self._written_s = np.ceil(latest[0].time_s * self.rate_hz) / self.rate_hz
+            if latest:
+                self._written_s = np.ceil(until_s * self.rate_hz) / self.rate_hz
             return ()
         out: list[Estimate] = []
-        while self._written_s <= latest[0].time_s:
-            aged = predict(before, self._written_s, self.follower.motion)
-            out += [estimate(aged, self.site, int(i), "predicted") for i in np.flatnonzero(aged.placed)]
+        while self._written_s <= until_s:
+            if self._written_s >= before.time_s:
+                aged = predict(before, self._written_s, self.follower.motion)
+                told = [i for i in np.flatnonzero(aged.placed).tolist() if i not in hidden]
+                out += [estimate(aged, self.site, i, "predicted") for i in told]
             self._written_s += 1.0 / self.rate_hz
         return tuple(out)
 

@@ -10,6 +10,7 @@ import pytest
 from locate.made_epochs import Drive, make_epoch, make_site
 from sonofix.locate.fix import fix
 from sonofix.locate.unstated import fix_by_residuals
+from sonofix.ranging import flights_m
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.site import Site
 
@@ -51,3 +52,25 @@ def test_neighbours_that_err_alike_count_less(rng: np.random.Generator) -> None:
     ratios = [squares(found(np.repeat(0.02 * rng.standard_normal(6), 4))) for _ in range(60)]
     # six errors for three unknowns: F of 3 and 3 degrees, whose median is 1 (its mean has no bound); by rows it is 7
     assert 0.3 < np.median(ratios) < 2.0
+
+
+@pytest.mark.parametrize("clock_m", [0.0, 35.0, 1700.0])
+def test_a_clock_that_is_unknown_adds_no_doubt_of_the_sound_speed(clock_m: float, rng: np.random.Generator) -> None:
+    site = make_site(ANCHORS, bounds_m=((-1.0, -1.0, 0.0), (11.0, 9.0, 4.0)))
+
+    def solve(epoch: RangeEpoch) -> tuple[Fix, ...]:
+        return (fix(epoch, site, "v"),)
+
+    ratios = []
+    for _ in range(20):
+        epoch = make_epoch(site, Drive(PLACE), sd_m=0.1, stated=True, clock_m=clock_m, rng=None)
+        flight_m = flights_m(epoch.range_m, True)
+        epoch = replace(
+            epoch,
+            range_m=epoch.range_m + 0.01 * rng.standard_normal(24),
+            covariance_m2=epoch.covariance_m2 + 0.01**2 * np.outer(flight_m, flight_m),
+            sound_speed_sd_mps=0.01 * epoch.sound_speed_mps,
+            sd_stated=False,
+        )
+        ratios.append(squares(fix_by_residuals(epoch, site, solve)[0]))
+    assert 0.05 < np.mean(ratios) < 2.5

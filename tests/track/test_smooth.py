@@ -288,3 +288,13 @@ def test_a_row_told_at_the_instant_of_a_knot_is_not_lost() -> None:
     halted = predict(halted, 0.95, follower.motion)
     np.testing.assert_allclose(halted.mean, whole.mean, atol=1e-12)
     np.testing.assert_allclose(halted.covariance, whole.covariance, atol=1e-12)
+
+
+def test_more_knots_than_memory_holds_are_refused_beforehand(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = make_site(HALL, level_m=1.1)
+    heard = heard_of(site, [make_epoch(site, Drive((3.0, 3.0, 1.1)), 0.5 * k, rng=rng) for k in range(4)])
+    monkeypatch.setattr("sonofix.track.smooth.MOST_BYTES", 1000.0)
+    with pytest.raises(ValueError, match="--lag"):
+        smooth(lambda: Follower(site), heard)

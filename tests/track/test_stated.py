@@ -141,3 +141,20 @@ def test_errors_age_to_what_is_known_of_their_variance() -> None:
     assert mean[stated.COMMON :] == pytest.approx(0.0)
     assert np.diag(covariance)[stated.COMMON :] == pytest.approx(stated.BEGIN_SD_M**2)
     assert free.all()
+
+
+@pytest.mark.parametrize("gap_s", [10.0, 30.0, 60.0])
+def test_after_silence_the_track_is_where_ranges_say(gap_s: float, rng: np.random.Generator) -> None:
+    street = Street(SITE)
+    street.sense({}, stated=PAIRS)
+    off = []
+    for k in range(60):
+        time_s = PERIOD_S * k + 0.05 + (gap_s if k >= 40 else 0.0)
+        epoch = make_epoch(SITE, Drive(circle(time_s)), sd_m=0.02, rng=rng, stated=True)
+        epoch = replace(epoch, time_s=np.full(len(PAIRS), time_s), sync_s=time_s)
+        for got in street.walk(epoch).estimates:
+            if k >= 40:
+                off.append(np.hypot(*(got.position_m[:2] - circle(time_s)[:2])))
+                assert off[-1] < 5 * np.hypot(got.sd("x") or 0.0, got.sd("y") or 0.0)
+    assert len(off) > 15
+    assert np.median(off) < 0.05

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sonofix.geometry import link
+from sonofix.ranging import flights_m
 from sonofix.records import Fix, RangeEpoch
 from sonofix.site import Site
 
@@ -33,7 +34,8 @@ def fix_by_residuals(epoch: RangeEpoch, site: Site, solve: Callable[[RangeEpoch]
     if epoch.sd_stated:
         return fixes
     relative = epoch.sound_speed_sd_mps / epoch.sound_speed_mps
-    own_m2 = np.diag(epoch.covariance_m2) - (relative * epoch.range_m) ** 2
+    flight_m = flights_m(epoch.range_m, epoch.clock == "common")
+    own_m2 = np.diag(epoch.covariance_m2) - (relative * flight_m) ** 2
     shares = [
         float(np.sum(f.residual_m[f.used] ** 2 / own_m2[f.used])) / spare
         for f in fixes

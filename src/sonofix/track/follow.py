@@ -111,6 +111,9 @@ class Follower:
         if before.inputs is not None and len(before.inputs.time_s):
             used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
         used |= taken
+        if taken.any() or any(event.event in ("slip", "reset") for event in events):
+            # a rival knows nothing of that
+            self._rival, self._undecided[:] = None, False
         self._loosen(before)
         used = self._contest(epoch, links, candidates, used, events)
         self.belief = self._course.head(self.belief)
@@ -215,10 +218,10 @@ class Follower:
         Returns the rows used.
         """
         trust, rival = self.belief.trust, self._rival
-        if trust is None or not len(epoch) or not self.belief.placed.any():
+        if trust is None or self.free_running or not len(epoch) or not self.belief.placed.any():
             return used
         if rival is not None:
-            rival = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
+            rival, heard = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
             self._rival = None if rival.lost or rival.won else rival
             self._undecided[rival.vehicle] &= self._rival is not None
             if rival.won:
@@ -227,7 +230,7 @@ class Follower:
                 x, y, z = estimate(self.belief, self.site, rival.vehicle, "fused").position_m
                 text = f"another place is likelier by far: ({x:.3f}, {y:.3f}, {z:.3f}) m"
                 events.append(Event(self.belief.time_s, self.site.vehicles[rival.vehicle].id, "reset", text))
-                return asked.copy()
+                return heard
         elif self.belief.time_s - self._looked_s >= ASKED_S:
             self._looked_s = self.belief.time_s
             for who in np.flatnonzero(self.belief.placed).tolist():

@@ -111,7 +111,11 @@ class Passage:
         if self._guide is not None:
             about = Nominal(self._guide.row, self._guide.now[self.epochs])
             follower.belief = replace(follower.belief, about=about)
+        hidden = follower.hidden
         _, used, events = follower.step(epoch, fixes)
+        anew = {event.vehicle for event in events if event.event == "reset"}
+        names = [vehicle.id for vehicle in follower.site.vehicles]
+        self._show({who for who in hidden - follower.hidden if names[who] not in anew})
         for opening in self._guide.openings if self._guide is not None else ():
             if opening.epoch == self.epochs:
                 follower.belief = _opened(follower.belief, opening)
@@ -145,6 +149,14 @@ class Passage:
     def _knot(self, mark: Mark) -> None:
         self.follower.belief = self.chain.knot(self.follower.belief)
         self.marks.append(replace(mark, hidden=self.follower.hidden))
+
+    def _show(self, vehicles: set[int]) -> None:
+        """Let vehicles be told of from when they were hidden: their track turned out to be right."""
+        for who in vehicles:
+            for k in range(len(self.marks) - 1, -1, -1):
+                if who not in self.marks[k].hidden:
+                    break
+                self.marks[k] = replace(self.marks[k], hidden=self.marks[k].hidden - {who})
 
     def back(self) -> Iterator[tuple[Mark, Belief]]:
         """Return knots smoothed, last first."""

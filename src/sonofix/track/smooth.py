@@ -26,6 +26,9 @@ PASSES = 3
 SETTLED = 0.1
 """Passes end when no state of an epoch moves by more of its own deviation."""
 
+MOST_BYTES = 4e9
+"""Of knots kept at once: a covariance and a tie of all states each."""
+
 BACK_SD_M = 1.0
 """A track is led back to before its vehicle's first fix while its place is known better than this."""
 
@@ -86,8 +89,25 @@ def settle(
 ) -> Passage:
     """Pass through a recording, as `smooth` says, until the track stays where it is; return the last pass.
 
-    ``rows``: it shall have knots before rows of the inputs in any case.
+    ``rows``: it shall have knots before rows of the inputs in any case. Where those are too many to be kept, there is
+    one pass without them, linearised where the filter did.
+
+    Raises
+    ------
+    ValueError
+        If even the epochs' knots are too many.
     """
+    belief = begin().belief
+    knot_bytes = 24.0 * len(belief.mean) ** 2
+    told = len(heard) if rate_hz is None or not heard else rate_hz * (heard[-1][0].sync_s - heard[0][0].sync_s)
+    knots = max(len(heard), told)
+    between = 0 if belief.inputs is None else len(belief.inputs.time_s)
+    if knots * knot_bytes > MOST_BYTES or (rows and (knots + between) * knot_bytes > MOST_BYTES):
+        need = (knots + between * rows) * knot_bytes / 1e9
+        text = f"smoothing {len(heard)} epochs of {len(belief.mean)} states at once takes {need:.0f} GB"
+        raise ValueError(f"{text}: smooth on the way, with --lag 10")
+    if (knots + between) * knot_bytes > MOST_BYTES:
+        passes = 1
     guide: Guide | None = None
     for left in reversed(range(passes)):
         passage = Passage(begin(), rate_hz, guide, rows or left > 0)

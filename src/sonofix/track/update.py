@@ -22,9 +22,12 @@ GATE_SIGMA = 5.0
 SETTLED = 1e-6
 """Iterations end when nothing in the state moves by more, in its own unit."""
 
+ASTRAY = 1e-3
+"""Ranges are not believed where the state still moves by more when iterations have run out."""
+
 
 def update(
-    belief: Belief, epoch: RangeEpoch, links: Links, candidates: NDArray[np.bool_], iterations: int = 4
+    belief: Belief, epoch: RangeEpoch, links: Links, candidates: NDArray[np.bool_], iterations: int = 20
 ) -> tuple[Belief, NDArray[np.bool_], Floats]:
     """Correct a belief, already predicted to the epoch's instant, by the epoch's rows.
 
@@ -45,6 +48,8 @@ def update(
     rows = np.flatnonzero(candidates & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
     clock, with_rates = epoch.clock == "common", epoch.range_rate_mps is not None
     if not len(rows) or (clock and not belief.free[-2]):
+        if belief.trust is not None:
+            belief = replace(belief, trust=replace(belief.trust, told=0.0))
         return belief, used, np.zeros(0)
     dt = epoch.time_s[rows] - belief.time_s
     noise = row_noise(epoch, links, rows, dt)
@@ -82,17 +87,19 @@ def update(
         links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
         pair = pair if trust is None else pair[near]
         miss, derivative, crossed = miss[both], derivative[both], crossed[both]
-    gain = np.zeros((0, 0))
+    gain, last = np.zeros((0, 0)), np.inf
     for k in range(iterations if belief.about is None else 1):
         if k:
             shown, derivative = expect(links, belief, mean, dt, epoch, pair)
             miss, crossed = measured - shown - derivative @ (belief.mean - mean), derivative @ belief.covariance
         gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
         moved = belief.mean + gain @ miss
-        settled = float(np.abs(moved - mean).max()) < SETTLED
-        mean = moved
-        if settled:
+        last, mean = float(np.abs(moved - mean).max()), moved
+        if last < SETTLED:
             break
+    if last > ASTRAY and iterations > 1 and belief.about is None:
+        used[:] = False
+        return belief, used, surprise
     keep = np.eye(len(mean)) - gain @ derivative
     covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
     after = replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2)
