@@ -14,7 +14,6 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import argparse  # noqa: E402
-import inspect  # noqa: E402
 import subprocess  # noqa: E402
 import sys  # noqa: E402
 import tempfile  # noqa: E402
@@ -31,24 +30,20 @@ from peers import graph, kalman, least_squares  # noqa: E402
 from peers.problem import Model, Setting, problem  # noqa: E402
 from peers.settings import TOLD, Told  # noqa: E402
 from sonofix import flow  # noqa: E402
-from sonofix.cli.run import run as run_command  # noqa: E402
 from sonofix.cli.score import score_run  # noqa: E402
 from sonofix.files import read_recording, read_truth  # noqa: E402
 from sonofix.records import Floats, Truth  # noqa: E402
 from sonofix.score import TrackColumns, TrackFigures, score_track, track_columns  # noqa: E402
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-SMOOTHS = "smooth" in inspect.signature(run_command).parameters
-"""Whether `sonofix run` has --smooth."""
 GRAPH_ITERATIONS = 12
-OURS = ("ours, causal", *(("ours, smoothed",) if SMOOTHS else ()))
 COLUMNS = (
     "recording",
     "least squares",
     "filterpy",
     "filterpy, more unknowns",
     "GTSAM batch, more unknowns",
-    *(f"{who}{what}" for who in OURS for what in ("", ": inside 2 sd", ": NEES")),
+    *(f"{who}{what}" for who in ("ours, causal", "ours, smoothed") for what in ("", ": inside 2 sd", ": NEES")),
 )
 
 _T = TypeVar("_T")
@@ -97,8 +92,7 @@ def row(folder: Path) -> list[str]:
     cells.append(metres(peer(truth, whole.time_s, whole.state)))
     tracks = timed(f"{name}: ours, causal", lambda: track_columns(flow.run(recording)))
     cells += ours(score_track(truth, tracks[vehicle]) if vehicle in tracks else None)
-    if SMOOTHS:
-        cells += ours(timed(f"{name}: ours, smoothed", lambda: smoothed(folder, vehicle)))
+    cells += ours(timed(f"{name}: ours, smoothed", lambda: smoothed(folder, vehicle)))
     return cells
 
 

@@ -149,6 +149,7 @@ def test_detector_waits_where_nothing_matches_or_rises(rng: np.random.Generator)
 def test_the_comparator_rises_at_either_sign_and_may_never() -> None:
     assert rises_at(np.array([0.1, -0.4, -0.6, 0.9])) == 2
     assert rises_at(np.array([0.5, -0.5])) is None
+    assert rises_at(np.array([])) is None
 
 
 @pytest.mark.parametrize(

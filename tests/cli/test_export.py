@@ -225,6 +225,19 @@ class TestNmea:
         assert [c[7] for c in cells] == ["07", "02", "02"] + [""] * 9
         assert [c[8] for c in cells] == ["1.3", "", ""] + [""] * 9
 
+    def test_fixes_without_a_row_are_as_none(self, yard):
+        folder, _ = yard
+        done("export", folder, "--as", "nmea", "--start", START, "-o", folder / "without.nmea")
+        (folder / "out" / "fixes.csv").write_text(self.FIXES.splitlines()[0] + "\n")
+        done("export", folder, "--as", "nmea", "--start", START, "-o", folder / "empty.nmea")
+        assert (folder / "empty.nmea").read_bytes() == (folder / "without.nmea").read_bytes()
+
+    def test_a_start_before_2000_is_not_laid_to_the_import(self, yard):
+        folder, _ = yard
+        text = mistake("export", folder, "--as", "nmea", "--start", "1970-01-01T00:00:01Z")
+        assert "--start 1970-01-01T00:00:01Z: NMEA states years by two digits" in text
+        assert "import.toml" not in text
+
     def test_minutes_round_up_to_whole_degrees(self):
         from sonofix.files.track_nmea import angle_field
 
@@ -262,7 +275,51 @@ class TestNmea:
         assert "site.toml: origin: is missing" in mistake(*nmea, "--start", START)
 
 
+def test_an_unknown_vertical_speed_counts_as_none(yard):
+    folder, columns = yard
+    velocities = []
+    for name, value in (("unknown", np.nan), ("none", 0.0)):
+        columns["vz_mps"] = np.full(12, value)
+        (folder / "out" / "track.csv").write_text("\n".join([HEADER, *rows(columns, "agv", ["fused"] * 12)]))
+        done("export", folder, "--as", "nmea", "--start", START, "-o", folder / f"{name}.nmea")
+        done("export", folder, "--as", "mcap", "-o", folder / f"{name}.mcap")
+        found = [m[3].vector for m in messages(folder / f"{name}.mcap") if m[0] == "/agv/velocity"]
+        velocities.append([(v.x, v.y, v.z) for v in found])
+    assert (folder / "unknown.nmea").read_bytes() == (folder / "none.nmea").read_bytes()
+    assert velocities[0] == velocities[1]
+    assert len(velocities[0]) == 12
+    columns["vx_mps"] = np.full(12, np.nan)
+    (folder / "out" / "track.csv").write_text("\n".join([HEADER, *rows(columns, "agv", ["fused"] * 12)]))
+    assert "12 messages" in done("export", folder, "--as", "mcap")
+
+
 class TestFiles:
+    def test_one_of_several_vehicles_goes_where_it_is_told_to(self, tmp_path):
+        (tmp_path / "site.toml").write_text(TEAM)
+        track, other, out = (tmp_path / name for name in ("track.csv", "a-r1.tum", "a.tum"))
+        track.write_text("\n".join([HEADER, *rows(numbers(3), "r1", ["fused"] * 3)]))
+        other.write_text("mine")
+        done("export", tmp_path, track, "--as", "tum", "-o", out)
+        assert len(out.read_text().splitlines()) == 3
+        assert other.read_text() == "mine"
+        out.write_text("mine")
+        assert "is there already; give --force" in mistake("export", tmp_path, track, "--as", "tum", "-o", out)
+        assert out.read_text() == "mine"
+        done("export", tmp_path, track, "--as", "tum", "-o", out, "--force")
+        assert len(out.read_text().splitlines()) == 3
+
+    def test_names_that_files_spell_alike_lose_no_vehicle(self, tmp_path):
+        (tmp_path / "site.toml").write_text(TEAM.replace('"r1"', '"r/1"').replace('"r2"', '"r_1"'))
+        track = tmp_path / "track.csv"
+        lines = [line for v, n in (("r_1", 2), ("r/1", 3)) for line in rows(numbers(n), v, ["fused"] * n)]
+        track.write_text("\n".join([HEADER, *lines]))
+        done("export", tmp_path, track, "--as", "tum")
+        found = {p.name: len(p.read_text().splitlines()) for p in tmp_path.glob("*.tum")}
+        assert found == {"track-r_1.tum": 3, "track-r_1_.tum": 2}
+        # alone a vehicle has the same file as among others
+        done("export", tmp_path, track, "--as", "tum", "--vehicle", "r_1")
+        assert {p.name: len(p.read_text().splitlines()) for p in tmp_path.glob("*.tum")} == found
+
     def test_several_vehicles(self, tmp_path):
         (tmp_path / "site.toml").write_text(TEAM)
         (tmp_path / "out").mkdir()

@@ -137,7 +137,8 @@ class TestFolders:
 
     def test_mistakes_write_nothing(self, tmp_path, bag):
         unknown = write_bag(tmp_path / "other", [("/uwb", RANGE, START_NS, ranged(START_NS, 3.0, "tag"))])
-        for path, options in ((bag, ("--zero", "noon")), (unknown, ()), (tmp_path / "no", ())):
+        zeros = ("noon", "1e30", "2000000000", "1e999999")
+        for path, options in (*((bag, ("--zero", zero)) for zero in zeros), (unknown, ()), (tmp_path / "no", ())):
             done = call("import", path, tmp_path / "run", "--site", tmp_path / "yard.toml", *options)
             assert done.exit_code == 2
             assert done.stderr.count("\n") == 1

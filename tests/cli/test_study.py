@@ -82,6 +82,35 @@ def test_the_picture_shows_every_curve_within_its_panel() -> None:
     assert {found_text(f) for f in sheet.findings} <= written
 
 
+def test_maps_have_equal_axes_and_long_names_end_before_their_figures(caplog: pytest.LogCaptureFixture) -> None:
+    work = studies.begin("robots", 2, 0, 0, "collision")
+    for _ in work.work():
+        pass
+    sheet = work.sheet()
+    assert sheet is not None
+    found = [(f.case, f.quantity, found_text(f)) for f in sheet.findings]
+    case, quantity, figure_text = found[0]
+    found[0] = (f"{case}, and what else there is to say of it, told at length and without haste", quantity, figure_text)
+    figure = draw_study(sheet, found)
+    figure.draw_without_rendering()
+    assert not caplog.records
+    maps = [axes for axes in figure.axes if (axes.get_xlabel(), axes.get_ylabel()) == ("x, m", "y, m")]
+    assert maps
+    for axes in maps:
+        (left, low), (right, high) = axes.transData.transform([(0.0, 0.0), (1.0, 1.0)])
+        assert right - left == pytest.approx(high - low)
+        assert np.ptp(axes.get_ylim()) >= 27.0 - 1e-9
+    texts = {text.get_text(): text.get_window_extent() for text in figure.texts}
+    for case, quantity, figure_text in found:
+        name = texts[f"{case}: {quantity}"]
+        beside = [
+            text.get_window_extent()
+            for text in figure.texts
+            if text.get_text() == figure_text and abs(text.get_window_extent().y0 - name.y0) < 6
+        ]
+        assert any(box.x0 > name.x1 for box in beside)
+
+
 class _Halted:
     """Does some pieces of a study, then is stopped."""
 
@@ -135,6 +164,7 @@ def test_mistakes_are_lines(tmp_path: Path) -> None:
         (0.997, 0.00018, "", "99.700 ± 0.018 %"),
         (0.0, 0.0, "m", "0.0 mm"),
         (4.9536, 0.0021, "V", "4.9536 ± 0.0021 V"),
+        (4.97790012, 0.0000234, "V", "4.977900 ± 0.000023 V"),
         (2.049, 0.048, "1", "2.049 ± 0.048"),
     ],
 )

@@ -119,6 +119,7 @@ class TestDamage:
             found = read_bag(path, YARD)
             (note,) = found.notes
             assert note.startswith("a.mcap is cut off or damaged after ")
+            assert note.endswith(" messages (it ends too early); those are read")
             counts.append(sum(t.messages for t in found.topics))
         assert 0 < counts[0] < counts[1] < len(MESSAGES)
 
@@ -218,6 +219,27 @@ class TestTimes:
     def test_time_zero_can_be_given(self, tmp_path):
         found = read_bag(write_bag(tmp_path / "bag", odom(3)), YARD, zero_ns=START_NS + 250 * MS)
         np.testing.assert_allclose(found.tables["odometry"].columns["time_s"], [-0.25, -0.15, -0.05], atol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("zero_ns", "shown"),
+        [
+            (10**39, "1.000000000000000000000000000E+30"),
+            (-(10**39), "-1.000000000000000000000000000E+30"),
+            (2 * 10**18, "2000000000"),
+            (START_NS + 200 * MS + 86_400 * 10**9 + 1, "1700086400.200000001"),
+            (START_NS - 86_400 * 10**9 - 1, "1699913599.999999999"),
+        ],
+    )
+    def test_a_time_zero_far_from_the_messages_is_told(self, tmp_path, zero_ns, shown):
+        text = told(read_bag, write_bag(tmp_path / "bag", odom(3)), YARD, zero_ns=zero_ns)
+        assert f'--zero = "{shown}": lies over a day' in text
+        assert "the earliest of which is of 1700000000.000000000 s" in text
+
+    @pytest.mark.parametrize("zero_ns", [START_NS + 200 * MS + 86_400 * 10**9, START_NS - 86_400 * 10**9])
+    def test_time_zero_may_lie_a_day_off(self, tmp_path, zero_ns):
+        found = read_bag(write_bag(tmp_path / "bag", odom(3)), YARD, zero_ns=zero_ns)
+        expected = [(START_NS + k * 100 * MS - zero_ns) / 1e9 for k in range(3)]
+        np.testing.assert_array_equal(found.tables["odometry"].columns["time_s"], expected)
 
     def test_rows_of_one_time_stand_once(self, tmp_path):
         messages = odom(3)

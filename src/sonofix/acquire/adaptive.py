@@ -155,9 +155,8 @@ def matches(mean_v: float, expected_v: float, half_band_v: float = MATCH_BAND_V)
 
 def rises_at(samples: Floats, threshold_v: float = COMPARATOR_V) -> int | None:
     """First sample at which rectified ``samples`` (n,) exceed the comparator's threshold; None where none does."""
-    above = np.abs(samples) > threshold_v
-    first = int(np.argmax(above))
-    return first if above[first] else None
+    above = np.flatnonzero(np.abs(samples) > threshold_v)
+    return int(above[0]) if len(above) else None
 
 
 def listen(

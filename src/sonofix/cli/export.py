@@ -60,7 +60,7 @@ def export(
     [origin] in the site file, and to know when time 0 was.
     """
     from sonofix import files
-    from sonofix.files.results import by_vehicle, plain_name, read_track
+    from sonofix.files.results import by_vehicle, read_track
 
     site = files.read_site(recording / "site.toml")
     source = _track_file(recording, track)
@@ -70,21 +70,24 @@ def export(
         if vehicle not in tracks:
             raise ValueError(f"--vehicle {vehicle}: {source} has no row of it; it has {', '.join(tracks)}")
         table, tracks = tracks[vehicle], {vehicle: tracks[vehicle]}
-    single = form in (Form.mcap, Form.parquet) or len(site.vehicles) < 2 or (vehicle is not None and out is not None)
-    if out is not None and not single and len(tracks) > 1:
+    alone = len(site.vehicles) < 2 or (out is not None and len(tracks) == 1)
+    single = form in (Form.mcap, Form.parquet) or alone
+    if out is not None and not single:
         raise ValueError(
             f"-o {out}: {form.value} holds one vehicle a file; choose one with --vehicle, or leave -o away"
         )
     target = out or source.with_suffix(f".{form.value}")
-    if out is not None and out.exists() and not force:
-        remedy = "is a folder; name a file" if out.is_dir() else "is there already; give --force to replace it"
-        raise files.RecordingError([files.Problem(str(out), "", None, remedy)])
     parts = {target: table}
     if not single:
-        parts = {target.with_stem(f"{target.stem}-{plain_name(name)}"): rows for name, rows in tracks.items()}
+        names = _file_names([one.id for one in site.vehicles])
+        parts = {target.with_stem(f"{target.stem}-{names[name]}"): rows for name, rows in tracks.items()}
+    for path in parts:
+        if out is not None and path.exists() and not force:
+            remedy = "is a folder; name a file" if path.is_dir() else "is there already; give --force to replace it"
+            raise files.RecordingError([files.Problem(str(path), "", None, remedy)])
     zero_ns = _zero_ns(recording, start)
     if form is Form.nmea:
-        _nmea_needs(site, recording, zero_ns)
+        _nmea_needs(site, recording, zero_ns, start)
     try:
         for path, rows in parts.items():
             count, what = _write(form, path, rows, source, site, recording, zero_ns, frame, talker)
@@ -96,6 +99,19 @@ def export(
 def _track_file(recording: Path, track: Path | None) -> Path:
     place = track or recording / "out"
     return place / "track.csv" if place.is_dir() or not place.suffix else place
+
+
+def _file_names(vehicles: list[str]) -> dict[str, str]:
+    """Return each vehicle's part of file names, no two alike."""
+    from sonofix.files.results import plain_name
+
+    names: dict[str, str] = {}
+    for vehicle in vehicles:
+        name = plain_name(vehicle)
+        while name in names.values():
+            name += "_"
+        names[vehicle] = name
+    return names
 
 
 def _zero_ns(recording: Path, start: str | None) -> int | None:
@@ -115,7 +131,7 @@ def _zero_ns(recording: Path, start: str | None) -> int | None:
     return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
 
 
-def _nmea_needs(site: Site, recording: Path, zero_ns: int | None) -> tuple[Origin, int]:
+def _nmea_needs(site: Site, recording: Path, zero_ns: int | None, start: str | None = None) -> tuple[Origin, int]:
     """Return the site's origin and when time 0 was, without which there is no NMEA."""
     from sonofix import files
 
@@ -124,6 +140,8 @@ def _nmea_needs(site: Site, recording: Path, zero_ns: int | None) -> tuple[Origi
         raise files.RecordingError([files.Problem(str(recording / "site.toml"), "origin", None, remedy)])
     if zero_ns is None:
         raise ValueError("NMEA states the time of day: say with --start when time 0 was, such as 2026-01-31T12:00:00Z")
+    if zero_ns < _YEAR_2000_NS and start is not None:
+        raise ValueError(f"--start {start}: NMEA states years by two digits, from 2000 on; say when time 0 really was")
     if zero_ns < _YEAR_2000_NS:
         remedy = "is no time of day, but a clock that began near 0 (a simulation's?); say with --start when time 0 was"
         raise files.RecordingError([files.Problem(str(recording / "import.toml"), "zero_ns", zero_ns, remedy)])

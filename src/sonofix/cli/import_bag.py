@@ -84,11 +84,11 @@ def import_bag(
 
 def _nanoseconds(text: str) -> int:
     """Read seconds as nanoseconds, exactly."""
-    from decimal import Decimal, InvalidOperation
+    from decimal import Decimal
 
     try:
         return int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError):
+    except (ArithmeticError, ValueError):
         raise ValueError(f"--zero {text}: must be seconds since 1970, such as 1700000000.25") from None
 
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from sonofix.records import Finding, Sheet
     from sonofix.studies.work import Work
 
-OUTPUTS = ("study.png", "curves.csv", "findings.json")
-
 
 def study(
     name: Annotated[str, typer.Argument(help="quasi-gps, pedestrian or robots.")],
@@ -104,7 +102,7 @@ def found_text(finding: Finding) -> str:
     }.get(finding.unit, (1.0, finding.unit))
     value, sd = factor * finding.value, factor * (finding.sd or 0.0)
     scale = sd or abs(value) / 10 or 1.0
-    digits = min(max(1 - floor(log10(scale)), 0), 4)
+    digits = min(max(1 - floor(log10(scale)), 0), 6)
     doubt = f" ± {sd:.{digits}f}" if finding.sd else ""
     return f"{value:.{digits}f}{doubt} {unit}".rstrip()
 

@@ -22,6 +22,8 @@ _LINES = {
 _LEFT, _RIGHT, _TOP = 0.05, 1.0, 0.845
 _LINE = 0.0205
 """Height of a line of the table, as a share of the figure's."""
+_GAP_PX = 18.0
+"""Least room between a name and its figure."""
 
 
 def draw_study(sheet: Sheet, found: Sequence[tuple[str, str, str]] = ()) -> Figure:
@@ -53,8 +55,10 @@ def draw_study(sheet: Sheet, found: Sequence[tuple[str, str, str]] = ()) -> Figu
             column, line = divmod(k, max(lines, 1))
             y = floor - 0.045 - _LINE * line
             x, width = _LEFT + column * (_RIGHT - _LEFT) / 3, (_RIGHT - _LEFT) / 3 - 0.05
-            figure.text(x, y, f"{case}: {quantity}", fontsize=8.5, color=style.MUTED, va="center")
-            figure.text(x + width, y, figure_text, fontsize=9, color=style.INK, va="center", ha="right")
+            right = figure.text(x + width, y, figure_text, fontsize=9, color=style.INK, va="center", ha="right")
+            name = figure.text(x, y, f"{case}: {quantity}", fontsize=8.5, color=style.MUTED, va="center")
+            room_px = right.get_window_extent().x0 - _GAP_PX - name.get_window_extent().x0
+            name.set_fontsize(8.5 * min(1.0, room_px / name.get_window_extent().width))
     return figure
 
 
@@ -73,5 +77,9 @@ def _panel(axes: Axes, panel: Panel) -> None:
         axes.set_ylim(*panel.y_limits)
     ends = np.concatenate([curve.x[np.isfinite(curve.x)] for curve in panel.curves])
     axes.set_xlim(float(ends.min()), float(ends.max()))
+    if (panel.x_label, panel.y_label) == ("x, m", "y, m"):
+        # limits count as proposals, which the aspect may widen
+        axes.set_autoscale_on(True)
+        axes.set_aspect("equal", adjustable="datalim")
     columns = len(panel.curves) if panel.logarithmic else 1
     axes.legend(loc="upper left" if panel.logarithmic else "best", fontsize=8.5, ncols=columns, handlelength=1.8)

@@ -68,7 +68,7 @@ class Bag:
     def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[tuple[Topic, int, bytes]]:
         """Iterate over the messages of the topics that ``wanted`` says yes to: topic, time of receipt (ns), bytes.
 
-        An MCAP file that is cut off or damaged gives what comes before, and a note.
+        An MCAP file that is cut off or damaged gives what whole chunks come before, and a note.
 
         Raises
         ------
@@ -278,4 +278,8 @@ def _defined(kind: str, definition: str) -> Typestore:
 
 
 def _reason(error: Exception) -> str:
+    from mcap.exceptions import EndOfFile
+
+    if isinstance(error, EndOfFile):
+        return "it ends too early"
     return one_line(str(error)).rstrip(".")[:200] or type(error).__name__

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from itertools import chain
 from pathlib import Path
 
@@ -107,7 +108,7 @@ def read_bag(
     ------
     RecordingError
         With the mistakes found: a bag that cannot be read, nothing in it to take, a topic of which it cannot be told
-        whose it is, two topics for one file, clocks that do not fit each other.
+        whose it is, two topics for one file, clocks that do not fit each other, a time 0 over a day from all messages.
     ValueError
         If rosbags and mcap are not installed.
     """
@@ -125,8 +126,10 @@ def read_bag(
     notes = [*bag.notes, *(note for time in times for note in time.notes)]
     notes += [f"{one.topic.name} has no messages" for one in heard.values() if not one.rows]
     notes += _one_clock(file, taken, times)
+    first_ns = min(int(time.time_ns[time.keep].min()) for time in times)
     if zero_ns is None:
-        zero_ns = min(int(time.time_ns[time.keep].min()) for time in times)
+        zero_ns = first_ns
+    _near_zero(file, zero_ns, first_ns, max(int(time.time_ns[time.keep].max()) for time in times))
     problems: list[Problem] = []
     reports: dict[Topic, TopicReport] = {}
     pieces: list[_Piece] = []
@@ -202,6 +205,18 @@ def _one_clock(file: str, taken: list[Heard], times: list[Timed]) -> Iterator[st
     if times[late].lag_ns - times[early].lag_ns > LAG_NS:
         lags = [f"{taken[i].topic.name} {times[i].lag_ns / 1e9:.3f} s" for i in (late, early)]
         yield f"messages come {' and '.join(lags)} after their stamps: are both of one clock?"
+
+
+def _near_zero(file: str, zero_ns: int, first_ns: int, last_ns: int) -> None:
+    """Refuse a time 0 further than a day from all messages, or one that is no int64."""
+    near = first_ns - DAY_NS <= zero_ns <= last_ns + DAY_NS
+    if near and abs(zero_ns) < 2**63:
+        return
+    remedy = (
+        f"lies over a day from the messages, the earliest of which is of {seconds(first_ns)} s; say when time 0 was by "
+        "their clock, in s since 1970; where the folder's import.toml holds it, import to a new folder"
+    )
+    raise RecordingError([Problem(file, "--zero", str(Decimal(zero_ns) / 1_000_000_000), remedy)])
 
 
 def _pieces(

@@ -24,9 +24,11 @@ def read_track(path: Path, site: Site) -> Table:
     Raises
     ------
     RecordingError
-        Where it is not there or holds mistakes, a vehicle that the site lacks for example.
+        Where it is not there, has no rows or holds mistakes, a vehicle that the site lacks for example.
     """
     table = _read(path, _NEEDED["track.csv"])
+    if not len(table.columns["time_s"]):
+        raise RecordingError([Problem(str(path), "", None, "has no rows below its first line")])
     ids = [vehicle.id for vehicle in site.vehicles]
     if "vehicle" not in table.names and len(ids) == 1:
         table = Table(table.columns, {**table.names, "vehicle": (ids[0],) * len(table.columns["time_s"])})
@@ -38,7 +40,13 @@ def read_track(path: Path, site: Site) -> Table:
 
 
 def read_fixes(path: Path) -> Table | None:
-    """Read the fixes of a run; None where there are none. Errors as `read_track`."""
+    """Read the fixes of a run, of which there may be none; None where there is no such file.
+
+    Raises
+    ------
+    RecordingError
+        Where it holds mistakes.
+    """
     return _read(path, _NEEDED["fixes.csv"]) if path.exists() else None
 
 
@@ -78,12 +86,11 @@ def _read(path: Path, needed: tuple[str, ...]) -> Table:
     for line, row in enumerate(rows, 2):
         if len(row) != len(header):
             sheet.tell(f"line {line}", ",".join(row), f"has {len(row)} cells where line 1 names {len(header)} columns")
-    if not rows:
-        sheet.tell("", None, "has no rows below its first line")
     sheet.check()
     columns: dict[str, Floats] = {}
     names: dict[str, tuple[str, ...]] = {}
-    for name, cells in zip(header, zip(*rows, strict=True), strict=True):
+    by_column = zip(*rows, strict=True) if rows else ((),) * len(header)
+    for name, cells in zip(header, by_column, strict=True):
         if name in _TEXT:
             names[name] = cells
         else:

@@ -11,7 +11,7 @@ import numpy as np
 from sonofix.files.bag import needed
 from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.results import by_vehicle, column
-from sonofix.files.track_tables import positions, quaternions
+from sonofix.files.track_tables import positions, quaternions, velocities
 from sonofix.files.writing import write_whole
 from sonofix.records import Floats, Table
 
@@ -104,7 +104,7 @@ def _messages(store: Any, track: Table, topic: str, zero_ns: int, frame: str) ->
     header, stamp = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
     vector = types["geometry_msgs/msg/Vector3"]
     place, turn, covariance = positions(track), quaternions(track), _covariances(track)
-    velocity = np.column_stack([column(track, f"v{axis}_mps") for axis in "xyz"])
+    velocity = velocities(track)
     made = []
     for i, time_s in enumerate(track.columns["time_s"].tolist()):
         # a float64 of seconds since 1970 would be off by a tenth of a microsecond

@@ -12,7 +12,7 @@ import numpy as np
 from sonofix.files.geodesy import on_earth
 from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.results import column
-from sonofix.files.track_tables import positions
+from sonofix.files.track_tables import positions, velocities
 from sonofix.files.writing import write_whole
 from sonofix.records import Floats, Table
 from sonofix.site import Origin
@@ -56,7 +56,7 @@ def write_nmea(path: Path, track: Table, fixes: Table | None, origin: Origin, ze
         raise ValueError(f"talker {talker!r}: must be two capital letters, such as IN, GP or GN")
     place = positions(track)
     rows = np.flatnonzero(np.isfinite(place).all(axis=1))
-    velocity = np.column_stack([column(track, f"v{axis}_mps") for axis in "xyz"])
+    velocity = velocities(track)
     lat, lon, height, there = on_earth(origin, place[rows], velocity[rows])
     times = track.columns["time_s"][rows]
     used, hdop = _of_fixes(fixes, times)

@@ -33,6 +33,12 @@ def positions(track: Table) -> Floats:
     return np.column_stack([track.columns[f"{axis}_m"] for axis in "xyz"])
 
 
+def velocities(track: Table) -> Floats:
+    """Return velocities, (n, 3); NaN where they are not known, but a vertical speed that is not known counts as 0."""
+    vx, vy, vz = (column(track, f"v{axis}_mps") for axis in "xyz")
+    return np.column_stack([vx, vy, np.where(np.isnan(vz), 0.0, vz)])
+
+
 def write_tum(path: Path, track: Table) -> int:
     """Write one vehicle's track as `time x y z qx qy qz qw`; return the number of rows.
 
