@@ -106,10 +106,10 @@ app(["--help"])
 
 
 def test_help_is_quick():
-    """Beside a bare command line of the same library, help costs next to nothing."""
+    """A dozen commands cost no more than the bare command line of the same library that they stand on."""
     floor_s = _fastest([sys.executable, "-c", BARE])
     help_s = _fastest([sys.executable, "-c", "from sonofix.cli.main import main; main()", "--help"])
-    assert help_s < 1.6 * floor_s + 0.05
+    assert help_s < 2.0 * floor_s + 0.05
 
 
 def test_help_needs_no_heavy_library():
