@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import groupby
@@ -43,7 +42,7 @@ def explain(
     ] = None,
     plot: Annotated[bool, typer.Option(help="Draw pictures.")] = True,
 ) -> None:
-    """Show what the receiver saw in one epoch: spectrum, searches, paths, what was cancelled and what left out.
+    """Show what the receiver saw in one epoch: spectrum, searches, paths, what was cancelled and left out.
 
     The recording is run up to that epoch, so that what the search expected is what it expected in the run. For example:
 
@@ -162,6 +161,8 @@ def _stage_rows(band: BandInsight) -> Iterator[tuple[str, tuple[str, str]]]:
 
 def _write_paths(path: Path, seen: Insight) -> None:
     """Write all paths, kept and dropped, a row each."""
+    import csv
+
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(_COLUMNS)

@@ -4,29 +4,43 @@ from __future__ import annotations
 
 import errno
 import sys
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from sonofix.cli.calibrate import calibrate
-from sonofix.cli.check import check
-from sonofix.cli.codes import codes
 from sonofix.cli.console import Stopped, heed_ctrl_c
-from sonofix.cli.demo import demo
-from sonofix.cli.explain import explain
-from sonofix.cli.export import export
-from sonofix.cli.import_bag import import_bag
-from sonofix.cli.plan import plan
-from sonofix.cli.run import run
-from sonofix.cli.score import score
-from sonofix.cli.simulate import simulate
-from sonofix.cli.study import study
-from sonofix.cli.survey import survey
+
+# what help says of each: a command is imported only when it is asked for, as all of them take longer than typer itself
+COMMANDS = {
+    "run": "Turn a recording into ranges, fixes, a track and a picture.",
+    "check": "Say what a recording holds: beacons, codes, microphones, samples, coverage, and anything odd.",
+    "simulate": "Make a recording folder: what the site's microphones would hear, 16 bit, and the truth beside it.",
+    "score": "Score ranges and track of a run against the recording's truth.",
+    "explain": "Show what the receiver saw in one epoch: spectrum, searches, paths, what was cancelled and left out.",
+    "codes": "Choose codes for beacons: those whose worst pair disturbs least.",
+    "plan": "Map what the beacons promise over the floor, and place more where they help most.",
+    "calibrate": "Learn a beacon's real burst, its delay and its clock from a recording at rest.",
+    "survey": "Find beacons, their delays and the sound speed from a drive among them; write a corrected site file.",
+    "study": "Redo a paper's simulation on its own numbers, check its claims, and run the same from waveforms.",
+    "import": "Bring a robot's bag into a recording: ranges, odometry, inertial sensors and, if asked for, truth.",
+    "export": "Write a track as TUM, MCAP, Parquet or NMEA.",
+    "demo": "Simulate a drive through a hall, run the receiver on it, draw.",
+}
+# where a command cannot be named as it is called
+MODULES = {"import": "import_bag"}
 
 MISUSE = 2
 INTERRUPTED = 130
 BROKEN = 1
+
+PLAIN: Any = {
+    "add_completion": False,
+    "pretty_exceptions_enable": False,
+    "rich_markup_mode": None,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
 
 
 class Shell(TyperGroup):
@@ -35,6 +49,24 @@ class Shell(TyperGroup):
     Exit codes: 2 for mistakes in what was given (each on a line) and for disks that are full or closed to us, 130 after
     Ctrl-C, 1 for a mistake of the program itself.
     """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Name the commands in the order of help."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Import a command; None where there is none of that name."""
+        if cmd_name not in self.commands and cmd_name in COMMANDS:
+            module = MODULES.get(cmd_name, cmd_name)
+            one = typer.Typer(**PLAIN)
+            one.command(cmd_name)(getattr(import_module(f"sonofix.cli.{module}"), module))
+            self.commands[cmd_name] = typer.main.get_command(one)
+        return super().get_command(ctx, cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """List what each command does, without importing it."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of this context."""
@@ -75,15 +107,7 @@ def _told(error: Exception) -> tuple[int, list[str]]:
     return BROKEN, [f"mistake in sonofix: {kind}: {text}", "`sonofix --debug …` shows where; please report it"]
 
 
-app = typer.Typer(
-    cls=Shell,
-    name="sonofix",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+app = typer.Typer(cls=Shell, name="sonofix", no_args_is_help=True, **PLAIN)
 
 
 def _version(wanted: bool) -> None:
@@ -102,11 +126,6 @@ def sonofix(
     debug: Annotated[bool, typer.Option("--debug", help="Show where an error came from.")] = False,
 ) -> None:
     """Positioning by sound: from microphone samples to a fused track."""
-
-
-for command in (run, check, simulate, score, explain, codes, plan, calibrate, survey, study, export, demo):
-    app.command()(command)
-app.command("import")(import_bag)
 
 
 def main() -> None:

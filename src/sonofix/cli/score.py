@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,8 +12,6 @@ import typer
 from sonofix.cli.console import counted, figure_text, length_text, print_table
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from sonofix.records import Floats
     from sonofix.score import RangeColumns, RangeFigures, TrackColumns, TrackFigures
     from sonofix.site import Site
@@ -31,6 +27,8 @@ def score(
     """Score ranges and track of a run against the recording's truth."""
     scored = score_run(recording, out or recording / "out")
     if as_json:
+        import json
+
         typer.echo(json.dumps(asdict(scored), indent=2, allow_nan=False))
         return
     if scored.ranges is not None:
@@ -152,6 +150,8 @@ class _Sheet:
     @classmethod
     def read(cls, path: Path, needed: tuple[str, ...]) -> _Sheet | None:
         """Read the file; None where it is not there."""
+        import csv
+
         from sonofix.files import Problem, RecordingError
 
         if not path.exists():

@@ -60,10 +60,7 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
         for axis in range(3):
             anchors[i, axis] = emitter_point[i, axis] if listening else receiver_point[i, axis]
         anchors[i, 2] -= receiver_point[i, 2] if listening else emitter_point[i, 2]
-    turns, tilts = False, False
-    for j in index:
-        turns |= j == YAW
-        tilts |= j == ROLL
+    turns, tilts = np.any(index == YAW), beforehand(index) > 0
     begins, state, attitudes = np.empty((MOST_STARTS + 1, 4)), np.empty(ALONE), np.zeros((2, 3))
     count, found = begin(anchors, measured[:n], flat, level_m, clock, begins), 0
     scarce = tilts and m < REDUNDANT * len(index)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.geometry import SIZE, YAW
 from sonofix.records import Floats
+
+AGILE_TURN_PSD = 20.0
+"""White angular acceleration in rad²/s³ that a vehicle whose turns a sensor tells adds to that of others: it turns on
+the spot, and rows tell."""
 
 
 def lift(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, size: int) -> None:
@@ -16,6 +21,20 @@ def lift(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, s
     mean[own] = 0.0
     covariance[own, :] = covariance[:, own] = 0.0
     free[own] = False
+
+
+def open_errors(covariance: Floats, free: NDArray[np.bool_], slot: int, sds: tuple[float, ...]) -> None:
+    """Open errors of a sensor from state ``slot`` on, in place, before anything but their deviations is known."""
+    for i, sd in enumerate(sds, start=slot):
+        covariance[i, i] = sd**2
+        free[i] = True
+
+
+def free_turns(covariance: Floats, free: NDArray[np.bool_], vehicle: int, dt: float) -> None:
+    """Let a vehicle whose heading is followed turn for ``dt``, in place, as freely as rows of a sensor may tell."""
+    at = SIZE * vehicle + YAW
+    if free[at]:
+        stir(covariance, at, AGILE_TURN_PSD, dt)
 
 
 def stir(covariance: Floats, at: int, density: float, dt: float) -> None:

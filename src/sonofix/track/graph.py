@@ -57,15 +57,16 @@ def smooth(
     ModuleNotFoundError
         If gtsam is not installed.
     ValueError
-        If bursts come from a clock of their own (each epoch has another offset).
+        If bursts come from a clock of their own (each epoch has another offset), or a gyro tells of turns.
     """
     try:
         import gtsam
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(MISSING, name=error.name) from error
-    if begin().free_running:
+    follower = begin()
+    if follower.free_running:
         raise ValueError("a graph needs a clock that goes on from epoch to epoch; use --smooth without --graph here")
-    inputs = begin().belief.inputs
+    inputs = follower.belief.inputs
     if inputs is not None and np.any(inputs.gyro_slot >= 0):
         raise ValueError("a graph knows nothing of a gyro (imu.csv); use --smooth without --graph here")
     passage = settle(begin, heard, rate_hz, passes, on_epoch, rows=True)

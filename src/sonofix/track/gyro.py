@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, YAW
 from sonofix.records import Floats
-from sonofix.track.anchor import correct, stir
+from sonofix.track.anchor import correct, free_turns, open_errors
 
 BIAS_SD_RADPS = 0.02
 """Of the rate that is told at rest: a cheap gyro, uncalibrated."""
@@ -31,26 +31,19 @@ SUMMED_S = 0.05
 LONGEST_S = 0.5
 """A row that is followed by none for longer tells nothing."""
 
-AGILE_TURN_PSD = 20.0
-"""White angular acceleration in rad²/s³ that a vehicle with a gyro adds to that of others: it may turn suddenly, and
-its rows tell."""
-
 UNLIKELY = 40.0
 """Squared distance, over its variance, of a turn that is not believed."""
 
 
 def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
     """Open a gyro's bias, in place, before anything is known of it."""
-    covariance[slot + 1, slot + 1] = BIAS_SD_RADPS**2
-    free[slot + 1] = True
+    open_errors(covariance, free, slot + 1, (BIAS_SD_RADPS,))
 
 
 def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int, dt: float) -> None:
     """Let a gyro's bias wander for ``dt``, in place, and its vehicle's turns be as free as rows may tell."""
     covariance[slot + 1, slot + 1] += BIAS_PSD * abs(dt)
-    at = SIZE * vehicle + YAW
-    if free[at]:
-        stir(covariance, at, AGILE_TURN_PSD, dt)
+    free_turns(covariance, free, vehicle, dt)
 
 
 def take(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE
 from sonofix.records import Floats
-from sonofix.track.anchor import correct, stir
+from sonofix.track.anchor import correct, open_errors, stir
 
 LENGTH_SD = 0.05 / 0.6
 """Of the slow error of step length, as a share of it: 5 cm of a step of 60 cm."""
@@ -35,9 +35,7 @@ UNLIKELY = 40.0
 
 def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
     """Open a walker's step errors, in place, before anything is known of them."""
-    for i, sd in ((slot + 2, LENGTH_SD), (slot + 3, HEADING_SD_RAD)):
-        covariance[i, i] = sd**2
-        free[i] = True
+    open_errors(covariance, free, slot + 2, (LENGTH_SD, HEADING_SD_RAD))
 
 
 def wander(mean: Floats, covariance: Floats, vehicle: int, slot: int, dt: float, placed: bool) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE
 from sonofix.records import Floats
-from sonofix.track.anchor import correct, stir
+from sonofix.track.anchor import correct, free_turns, open_errors
 
 SCALE_SD = 0.05
 """Of the share of itself by which a speed is told too high; it stays what it is."""
@@ -46,10 +46,6 @@ UNSEEN_RAD = 0.2
 STANDING_MPS = 0.01
 """A lower speed is rest."""
 
-AGILE_TURN_PSD = 20.0
-"""White angular acceleration in rad²/s³ that a vehicle with odometry adds to that of others: it turns on the spot, and
-its rows tell."""
-
 LONGEST_S = 2.0
 """A row that is followed by none for longer tells nothing."""
 
@@ -65,9 +61,7 @@ ROBUST = 2.0
 
 def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
     """Open the errors of a vehicle's odometry, in place, before anything is known of them."""
-    for i, sd in ((slot + 3, SCALE_SD), (slot + 4, BIAS_SD_RADPS)):
-        covariance[i, i] = sd**2
-        free[i] = True
+    open_errors(covariance, free, slot + 3, (SCALE_SD, BIAS_SD_RADPS))
 
 
 def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int, dt: float) -> None:
@@ -75,9 +69,7 @@ def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int,
     span = abs(dt)
     covariance[slot + 3, slot + 3] += SCALE_PSD * span
     covariance[slot + 4, slot + 4] += BIAS_PSD * span
-    at = SIZE * vehicle + 3
-    if free[at]:
-        stir(covariance, at, AGILE_TURN_PSD, dt)
+    free_turns(covariance, free, vehicle, dt)
 
 
 def take(
