@@ -84,6 +84,18 @@ def test_follows_a_straight_drive(
         assert seen[-1].only.clock_offset_m == pytest.approx(clock_m, abs=0.1)
 
 
+def test_a_recording_may_begin_long_before_its_clock_shows_zero(rng: np.random.Generator) -> None:
+    site = make_site(HALL)
+    drive = Drive(PLACE)
+    epochs = drive_past(site, drive, 4, rng)
+    early = [replace(e, sync_s=e.sync_s - 5e6, time_s=e.time_s - 5e6) for e in epochs]
+    for s, told in zip(follow(Follower(site), early), follow(Follower(site), epochs), strict=True):
+        assert s.words == told.words
+        assert s.only.time_s == pytest.approx(told.only.time_s - 5e6)
+        np.testing.assert_allclose(s.only.position_m, told.only.position_m, atol=1e-5)
+        np.testing.assert_allclose(s.only.covariance, told.only.covariance, rtol=1e-3, atol=1e-9)
+
+
 def test_a_track_is_better_than_its_fixes(rng: np.random.Generator) -> None:
     site = make_site(HALL)
     drive = Drive((1.5, 2.0, 1.0), (0.5, 0.35, 0.0))

@@ -26,7 +26,7 @@ class Tally:
         self._of = {vehicle: _VehicleTally(site, vehicle) for vehicle in self.vehicles}
         self._heard = self._used = 0
         self._first_s: float | None = None
-        self._last_s = 0.0
+        self._last_s = -np.inf
         self._events: Counter[str] = Counter()
         self._remarks: Counter[str] = Counter()
 
@@ -44,7 +44,7 @@ class Tally:
 
     def headline(self) -> str:
         """Return one line: epochs, time, ranges."""
-        span_s = self._last_s - (self._first_s or 0.0)
+        span_s = 0.0 if self._first_s is None else self._last_s - self._first_s
         span = f"{span_s:.1f}" if span_s < 100 else f"{span_s:.0f}"
         share = f" ({100 * self._used / self._heard:.0f} %)" if self._heard else ""
         return f"{counted(self.epochs, 'epoch')} in {span} s, {self._used} of {self._heard} ranges used{share}"

@@ -97,6 +97,9 @@ class Follower:
         links = link(self.site, epoch.emitter, epoch.receiver)
         time_s = self._time(epoch, links)
         events: list[Event] = []
+        if not self.belief.placed.any() and not self._recent:
+            # a recording may begin before its clock's zero
+            self.belief = replace(self.belief, time_s=min(self.belief.time_s, time_s))
         self.belief = predict(self.belief, max(time_s, self.belief.time_s), self.motion)
         candidates = np.isfinite(epoch.range_m)
         for found in fixes:
