@@ -6,8 +6,6 @@ lowers the nose. At a pitch of ±90° yaw and roll are one; bodies that point th
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -35,7 +33,8 @@ def spin(pitch_rad: Floats | None, yaw_rad: Floats, rates_radps: tuple[Floats, F
     return np.stack([roll * level * cos - pitch * sin, roll * level * sin + pitch * cos, yaw - roll * down], axis=-1)
 
 
-def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
-    """Return x, y, z and w of the unit quaternion that turns body axes into east, north, up."""
-    (a, d), (b, e), (c, f) = ((math.sin(v / 2), math.cos(v / 2)) for v in (roll_rad, pitch_rad, yaw_rad))
-    return a * e * f - d * b * c, d * b * f + a * e * c, d * e * c - a * b * f, d * e * f + a * b * c
+def quaternion(roll_rad: ArrayLike, pitch_rad: ArrayLike, yaw_rad: ArrayLike) -> Floats:
+    """Return x, y, z and w, (4, …), of the unit quaternions that turn body axes into east, north, up."""
+    half = [0.5 * np.asarray(angle, float) for angle in (roll_rad, pitch_rad, yaw_rad)]
+    (a, d), (b, e), (c, f) = ((np.sin(angle), np.cos(angle)) for angle in half)
+    return np.array([a * e * f - d * b * c, d * b * f + a * e * c, d * e * c - a * b * f, d * e * f + a * b * c])

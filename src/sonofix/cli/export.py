@@ -65,6 +65,8 @@ def export(
     site = files.read_site(recording / "site.toml")
     source = _track_file(recording, track)
     table = read_track(source, site)
+    if not len(table.columns["time_s"]):
+        raise files.RecordingError([files.Problem(str(source), "", None, "has no rows below its first line")])
     tracks = dict(by_vehicle(table))
     if vehicle is not None:
         if vehicle not in tracks:

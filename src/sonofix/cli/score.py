@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonofix.cli.console import counted, figure_text, length_text, print_table
+from sonofix.cli.console import figure_text, length_text, print_table
 
 if TYPE_CHECKING:
-    from sonofix.records import Floats
+    from sonofix.records import Floats, Table
     from sonofix.score import RangeColumns, RangeFigures, TrackColumns, TrackFigures
     from sonofix.site import Site
 
@@ -66,7 +66,7 @@ def score_run(recording: Path, out: Path) -> Scored:
     if not any((out / name).is_file() for name in ("ranges.csv", "track.csv")):
         remedy = f"holds neither ranges.csv nor track.csv; first: sonofix run {recording}"
         raise files.RecordingError([files.Problem(str(out), "", None, remedy)])
-    ranges, track = read_ranges(out), read_track(out, site)
+    ranges, track = range_columns(out / "ranges.csv"), track_columns(out / "track.csv", site)
     # the speed matters only to say how long ago a moving beacon's sound left it: the simple formula is near enough
     speed = site.air.sound_speed_mps or float(air.sound_speed_linear_mps(site.air.temperature_c))
     figures = {
@@ -80,122 +80,53 @@ def score_run(recording: Path, out: Path) -> Scored:
     )
 
 
-def read_ranges(out: Path) -> RangeColumns | None:
-    """Read `ranges.csv` of a run; None where it is not there.
-
-    Raises
-    ------
-    RecordingError
-        Where a needed column is missing or a cell is no number.
-    """
-    import numpy as np
-
+def range_columns(path: Path) -> RangeColumns | None:
+    """Read the ranges of a run as what is scored; None where it wrote none."""
+    from sonofix.files.results import column, read_ranges
     from sonofix.score import RangeColumns
 
-    sheet = _Sheet.read(out / "ranges.csv", ("time_s", "from", "to", "range_m"))
-    if sheet is None:
+    table = read_ranges(path)
+    if table is None:
         return None
-    used = sheet.text("used", "1")
+    used = column(table, "used")
     return RangeColumns(
-        time_s=sheet.numbers("time_s"),
-        emitter=tuple(sheet.text("from")),
-        receiver=tuple(sheet.text("to")),
-        range_m=sheet.numbers("range_m"),
-        sd_m=sheet.numbers("sd_m"),
-        range_rate_mps=sheet.numbers("range_rate_mps"),
-        clock_offset_m=sheet.numbers("clock_offset_m"),
-        used=np.array([cell.strip().lower() in ("1", "true") for cell in used], bool),
+        time_s=table.columns["time_s"],
+        emitter=table.names["from"],
+        receiver=table.names["to"],
+        range_m=table.columns["range_m"],
+        sd_m=column(table, "sd_m"),
+        range_rate_mps=column(table, "range_rate_mps"),
+        clock_offset_m=column(table, "clock_offset_m"),
+        used=used != 0.0,
     )
 
 
-def read_track(out: Path, site: Site) -> dict[str, TrackColumns]:
-    """Read `track.csv` of a run, by vehicle; empty where it is not there. Errors as `read_ranges`."""
+def track_columns(path: Path, site: Site) -> dict[str, TrackColumns]:
+    """Read the track of a run as what is scored, by vehicle; empty where it wrote none."""
+    from sonofix.files.results import by_vehicle, read_track
+
+    return {vehicle: _track_of(table) for vehicle, table in by_vehicle(read_track(path, site))} if path.exists() else {}
+
+
+def _track_of(table: Table) -> TrackColumns:
     import numpy as np
 
+    from sonofix.files.results import column
     from sonofix.score import TrackColumns
 
-    sheet = _Sheet.read(out / "track.csv", ("time_s", "x_m", "y_m"))
-    if sheet is None:
-        return {}
-    only = site.vehicles[0].id if site.vehicles else ""
-    names = np.array([name or only for name in sheet.text("vehicle")])
-    time, yaw = sheet.numbers("time_s"), sheet.numbers("yaw_rad")
     place, velocity, sd = (
-        np.column_stack([sheet.numbers(f"{prefix}{axis}{unit}") for axis in "xyz"])
+        np.column_stack([column(table, f"{prefix}{axis}{unit}") for axis in "xyz"])
         for prefix, unit in (("", "_m"), ("v", "_mps"), ("sd_", "_m"))
     )
-    variance = np.full((len(time), 3, 3), np.nan)
+    variance = np.full((len(place), 3, 3), np.nan)
     variance[:, range(3), range(3)] = sd**2
     for i, j in ((0, 1), (0, 2), (1, 2)):
         variance[:, i, j] = variance[:, j, i] = np.where(np.isnan(sd[:, i] + sd[:, j]), np.nan, 0.0)
     tilt: tuple[Floats, ...] = ()
-    if "roll_rad" in sheet:
-        sds = [sheet.numbers(f"sd_{name}_rad") for name in ("roll", "pitch", "yaw")]
-        tilt = (sheet.numbers("roll_rad"), sheet.numbers("pitch_rad"), np.column_stack(sds))
-    tracks = {}
-    for vehicle in dict.fromkeys(names.tolist()):
-        rows = names == vehicle
-        tracks[vehicle] = TrackColumns(
-            time[rows], place[rows], velocity[rows], yaw[rows], variance[rows], *(column[rows] for column in tilt)
-        )
-    return tracks
-
-
-class _Sheet:
-    """A CSV file of a run as columns of text."""
-
-    def __init__(self, path: Path, columns: Mapping[str, list[str]], length: int) -> None:
-        self._path, self._columns, self._length = path, columns, length
-
-    @classmethod
-    def read(cls, path: Path, needed: tuple[str, ...]) -> _Sheet | None:
-        """Read the file; None where it is not there."""
-        import csv
-
-        from sonofix.files import Problem, RecordingError
-
-        if not path.exists():
-            return None
-        try:
-            with path.open(newline="", encoding="utf-8") as file:
-                header, *rows = list(csv.reader(file)) or [[]]
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise RecordingError([Problem(str(path), "", None, f"is no CSV text: {error}")]) from None
-        problems = [
-            Problem(str(path), "line 1", ",".join(header), f"column {name} is missing; is this a file of sonofix run?")
-            for name in needed
-            if name not in header
-        ]
-        problems += [
-            Problem(str(path), f"line {i}", None, f"has {counted(len(row), 'cell')} for {len(header)} columns")
-            for i, row in enumerate(rows, 2)
-            if len(row) != len(header)
-        ][:5]
-        if problems:
-            raise RecordingError(problems)
-        return cls(path, {name: [row[k] for row in rows] for k, name in enumerate(header)}, len(rows))
-
-    def __contains__(self, name: str) -> bool:
-        """Return whether there is such a column."""
-        return name in self._columns
-
-    def text(self, name: str, default: str = "") -> list[str]:
-        return self._columns.get(name, [default] * self._length)
-
-    def numbers(self, name: str) -> Floats:
-        """Return a column as numbers, NaN where a cell is empty or the column is missing."""
-        import numpy as np
-
-        from sonofix.files import Problem, RecordingError
-
-        values: np.ndarray = np.full(self._length, np.nan)
-        for i, cell in enumerate(self.text(name)):
-            try:
-                values[i] = float(cell) if cell.strip() else np.nan
-            except ValueError:
-                field = f"line {i + 2}, {name}"
-                raise RecordingError([Problem(str(self._path), field, cell, "must be a number")]) from None
-        return values
+    if "roll_rad" in table.columns:
+        sds = [column(table, f"sd_{name}_rad") for name in ("roll", "pitch", "yaw")]
+        tilt = (column(table, "roll_rad"), column(table, "pitch_rad"), np.column_stack(sds))
+    return TrackColumns(table.columns["time_s"], place, velocity, column(table, "yaw_rad"), variance, *tilt)
 
 
 def _range_rows(figures: RangeFigures) -> dict[str, tuple[str, str]]:

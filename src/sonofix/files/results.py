@@ -1,4 +1,4 @@
-"""Files that a run wrote, read back for export: the track, and the fixes beside it."""
+"""Files that a run wrote, read back to score and to export them: ranges, fixes, the track."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ from sonofix.files.tables import Sheet
 from sonofix.records import Floats, Table
 from sonofix.site import Site
 
-_TEXT = ("vehicle", "source", "status")
-_NEEDED = {"track.csv": ("time_s", "x_m", "y_m", "z_m"), "fixes.csv": ("time_s", "used")}
+_TEXT = ("vehicle", "source", "status", "from", "to")
+_NEEDED = {
+    "track.csv": ("time_s", "x_m", "y_m", "z_m"),
+    "fixes.csv": ("time_s", "used"),
+    "ranges.csv": ("time_s", "from", "to", "range_m"),
+}
 
 
 def read_track(path: Path, site: Site) -> Table:
@@ -24,11 +28,9 @@ def read_track(path: Path, site: Site) -> Table:
     Raises
     ------
     RecordingError
-        Where it is not there, has no rows or holds mistakes, a vehicle that the site lacks for example.
+        Where it is not there or holds mistakes, a vehicle that the site lacks for example.
     """
     table = _read(path, _NEEDED["track.csv"])
-    if not len(table.columns["time_s"]):
-        raise RecordingError([Problem(str(path), "", None, "has no rows below its first line")])
     ids = [vehicle.id for vehicle in site.vehicles]
     if "vehicle" not in table.names and len(ids) == 1:
         table = Table(table.columns, {**table.names, "vehicle": (ids[0],) * len(table.columns["time_s"])})
@@ -37,6 +39,11 @@ def read_track(path: Path, site: Site) -> Table:
             near = did_you_mean(vehicle, ids) if ids else "it has none"
             raise RecordingError([Problem(str(path), "vehicle", vehicle, f"no vehicle of the site; {near}")])
     return table
+
+
+def read_ranges(path: Path) -> Table | None:
+    """Read the ranges of a run; None where there is no such file. Errors as `read_fixes`."""
+    return _read(path, _NEEDED["ranges.csv"]) if path.exists() else None
 
 
 def read_fixes(path: Path) -> Table | None:

@@ -7,25 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from sonofix.attitude import quaternion
 from sonofix.files.results import column
-from sonofix.files.writing import write_whole
+from sonofix.files.writing import tum_row, write_whole
 from sonofix.records import Floats, Table
 
 NO_PARQUET = "writing Parquet needs pyarrow; pip install 'sonofix[parquet]'"
 
 
 def quaternions(track: Table) -> Floats:
-    """Return attitudes as quaternions x, y, z, w, (n, 4), of ZYX angles; an angle that is not known counts as 0."""
-    half = [0.5 * np.nan_to_num(column(track, name), nan=0.0) for name in ("roll_rad", "pitch_rad", "yaw_rad")]
-    (cr, cp, cy), (sr, sp, sy) = (tuple(turn(angle) for angle in half) for turn in (np.cos, np.sin))
-    return np.column_stack(
-        [
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
+    """Return attitudes as quaternions x, y, z, w, (n, 4); an angle that is not known counts as 0."""
+    angles = [np.nan_to_num(column(track, name), nan=0.0) for name in ("roll_rad", "pitch_rad", "yaw_rad")]
+    return quaternion(*angles).T
 
 
 def positions(track: Table) -> Floats:
@@ -48,15 +41,12 @@ def write_tum(path: Path, track: Table) -> int:
         Where it cannot be written.
     """
     rows = np.flatnonzero(np.isfinite(positions(track)).all(axis=1))
-    numbers = np.column_stack([track.columns["time_s"], positions(track), quaternions(track)])[rows]
+    time_s, place, turned = track.columns["time_s"], positions(track), quaternions(track)
 
     def make(part: Path) -> None:
         with part.open("w", newline="", encoding="utf-8") as file:
             lines = csv.writer(file, delimiter=" ", lineterminator="\n")
-            for row in numbers.tolist():
-                lines.writerow(
-                    [f"{value:.{digits}f}" for value, digits in zip(row, (9, 6, 6, 6, 9, 9, 9, 9), strict=True)]
-                )
+            lines.writerows(tum_row(time_s[i], place[i], turned[i]) for i in rows)
 
     write_whole(path, make)
     return len(rows)

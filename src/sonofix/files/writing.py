@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import heapq
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from sonofix.attitude import quaternion
 from sonofix.files.problem import Problem, RecordingError
+from sonofix.files.results import plain_name
 from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step
 from sonofix.site import Site
 
@@ -343,10 +343,14 @@ def _range_rows(step: Step) -> Iterator[tuple[float, list[str]]]:
 
 
 def _tum_row(estimate: Estimate) -> list[str]:
-    """Return `timestamp tx ty tz qx qy qz qw`; an angle that is not known is written as none turned."""
-    place = [format(float(value), ".6f") for value in estimate.position_m]
     turned = quaternion(estimate.roll_rad or 0.0, estimate.pitch_rad or 0.0, estimate.yaw_rad or 0.0)
-    return [_time(estimate.time_s), *place, *(format(part, ".9f") if part else "0" for part in turned)]
+    return tum_row(estimate.time_s, estimate.position_m, turned)
+
+
+def tum_row(time_s: float, place_m: Iterable[float], turned: Iterable[float]) -> list[str]:
+    """Return `timestamp tx ty tz qx qy qz qw`; an angle that is not known is written as none turned."""
+    place = (format(float(value), ".6f") for value in place_m)
+    return [_time(time_s), *place, *(format(float(part), ".9f") if part else "0" for part in turned)]
 
 
 def _event_row(event: Event) -> list[str]:
@@ -360,8 +364,7 @@ def _covariance(fix: Fix, a: str, b: str) -> float | None:
 
 
 def _tum_name(site: Site, vehicle: str) -> str:
-    safe = re.sub(r"[^\w.-]", "_", vehicle)
-    return "track.tum" if len(site.vehicles) < 2 else f"track-{safe}.tum"
+    return "track.tum" if len(site.vehicles) < 2 else f"track-{plain_name(vehicle)}.tum"
 
 
 def _cell(value: float | None, form: str) -> str:
