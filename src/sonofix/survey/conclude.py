@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats, OpenDirection, PairBias, Survey, SurveyedBeacon
 from sonofix.site import Site
@@ -136,7 +137,36 @@ def _covariance(task: Task, fit: Fit) -> tuple[Floats, float]:
     size, axes = np.linalg.eigh(held * unit[:, None] * unit[None, :])
     size = np.maximum(size, 1e-14)
     covariance = unit[:, None] * (axes / size) @ axes.T * unit[None, :]
+    inflation *= float(np.sqrt(alike(drive, z[0], fit.used)))
     return covariance * inflation**2, inflation
+
+
+def alike(drive: Drive, z: Floats, used: NDArray[np.bool_]) -> float:
+    """Return how many ranges in a row err alike: by so much fewer they count (Bartlett 1935), 1 where each is alone.
+
+    That is the sum of the autocorrelation of each pair's residuals, all pairs together, up to where it is lost in noise:
+    walls and antennas err for seconds, and what a bias or a scale leaves over stays for as long as the way is alike.
+
+    Parameters
+    ----------
+    z : float64 (m,)
+        Whitened residuals of the ranges used.
+    used : bool (n,)
+    """
+    rows = np.flatnonzero(used)
+    ends = [(drive.emitter[i], drive.receiver[i]) for i in rows]
+    number = {pair: i for i, pair in enumerate(dict.fromkeys(ends))}
+    pair = np.array([number[p] for p in ends], np.int64)
+    order = np.lexsort((drive.time_s[rows], pair))
+    z, pair = z[order], pair[order]
+    total, power = 1.0, float(np.mean(z**2)) if len(z) else 0.0
+    for lag in range(1, len(z) // max(2 * len(number), 1)):
+        same = pair[lag:] == pair[:-lag]
+        together = float(np.mean((z[lag:] * z[:-lag])[same])) / max(power, 1e-30)
+        if together < 3.0 / np.sqrt(np.count_nonzero(same)):
+            break
+        total += 2.0 * together
+    return total
 
 
 def _beacons(
