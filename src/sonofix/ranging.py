@@ -108,8 +108,8 @@ def with_sound_speed(epoch: RangeEpoch, sound_speed_mps: float, sound_speed_sd_m
 def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
     """Epochs of ranges that a recording states: one sweep over the pairs each, until a pair comes again.
 
-    What the site states of a pair's bias is taken off. Delays are not: a stated range is a way already. Whoever measured
-    it knew when the burst left and was heard; delays say when the site's own schedule lets it sound.
+    What the site states of a pair's bias is taken off. Delays are not: a stated range is a way already. Whoever
+    measured it knew when the burst left and was heard; delays say when the site's own schedule lets it sound.
     """
     epochs: list[RangeEpoch] = []
     order = np.argsort(rows.time_s, kind="stable")

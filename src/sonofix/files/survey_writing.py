@@ -81,8 +81,8 @@ def _try(path: Path) -> None:
 def corrected_text(text: str, before: Site, after: Site) -> str:
     """Return a site file's text with its fixed beacons' places, deviations, delays and biases as ``after`` has them.
 
-    Comments, order and everything else stay; pairs that are new stand at the end. Where the text is written in a way that cannot be edited line by line, the
-    whole is written anew, without comments.
+    Comments, order and everything else stay; pairs that are new stand at the end. Where the text is written in a way
+    that cannot be edited line by line, the whole is written anew, without comments.
 
     Parameters
     ----------

@@ -146,8 +146,9 @@ def survey(
 def thinned(epochs: Sequence[RangeEpoch]) -> tuple[list[RangeEpoch], tuple[Event, ...]]:
     """Leave epochs out where there are more ranges than an adjustment needs; say so.
 
-    Of each k epochs in a row one stays, drawn at random, so that no order in which beacons take turns falls in step with
-    it. Ranges a fraction of a second apart err much alike, so little is lost; deviations are those of what stays.
+    Of each k epochs in a row one stays, drawn at random, so that no order in which beacons take turns falls in
+    step with it. Ranges a fraction of a second apart err much alike, so little is lost; deviations are those of what
+    stays.
     """
     rows = sum(len(e) for e in epochs)
     most = 1 + int(CLOSE_S / max(_spacing_s(epochs), 1e-9))
