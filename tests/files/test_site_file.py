@@ -147,7 +147,9 @@ def test_the_schema_knows_every_key():
     assert "null" not in schema_text()
 
 
-PAIRED = GOOD + """
+PAIRED = (
+    GOOD
+    + """
 [[microphone]]
 id = "M"
 position_m = [1, 2, 3]
@@ -155,6 +157,7 @@ position_m = [1, 2, 3]
 from = "B"
 to = "M"
 """
+)
 
 
 def test_a_pairs_bias_is_read_and_written_back():
@@ -176,7 +179,10 @@ def test_a_pairs_bias_is_read_and_written_back():
         ("", "pair 1 bias_m: the pair tells nothing: give"),
         ("bias_m = 0.1\nbias = 2\n", "pair 1 bias = 2: unknown key; did you mean bias_m"),
         ("bias_m = 0.1\nemitter = 'B'\n", "pair 1 emitter"),
-        ("bias_m = 0.1\n[[pair]]\nfrom = 'C'\nto = 'M'\nbias_m = 0.1\n", 'pair 2 from = "C": no [[beacon]] has this id'),
+        (
+            "bias_m = 0.1\n[[pair]]\nfrom = 'C'\nto = 'M'\nbias_m = 0.1\n",
+            'pair 2 from = "C": no [[beacon]] has this id',
+        ),
         ("bias_m = 0.1\n[[pair]]\nfrom = 'B'\nto = 'N'\nbias_m = 0.1\n", "(known: M); correct the name"),
         ("bias_m = 0.1\n[[pair]]\nfrom = 'B'\nto = 'M'\nbias_m = 0.2\n", "pair 1 is from B to M already"),
         ("bias_m = 0.1\n[[pair]]\nto = 'M'\nbias_m = 0.2\n", "pair 2 from: is missing; add it"),

@@ -137,4 +137,6 @@ def test_biases_change_where_they_stand_and_new_ones_are_added() -> None:
     assert text.rstrip().endswith("bias_sd_m = 0.003")
     # without a line's end, too
     bare = parse_site(TEXT)
-    assert parse_site(corrected_text(TEXT.rstrip(), bare, bare.model_copy(update={"pairs": (second,)}))).pairs == (second,)
+    assert parse_site(corrected_text(TEXT.rstrip(), bare, bare.model_copy(update={"pairs": (second,)}))).pairs == (
+        second,
+    )

@@ -54,7 +54,7 @@ def test_epochs_that_are_far_apart_all_stay(rng: np.random.Generator) -> None:
 def test_ranges_that_err_alike_count_for_fewer(rho: float, factor: float) -> None:
     # a first-order process: (1 + rho) / (1 - rho) (Bartlett 1935)
     rng = np.random.default_rng(4)
-    task = gather(KNOWN, drive(1500, 0.1, rng))
+    task = gather(KNOWN, drive(500, 0.1, rng))
     z = np.zeros(len(task))
     for beacon in range(len(HALL)):
         rows = np.flatnonzero(task.point == beacon)
@@ -62,15 +62,15 @@ def test_ranges_that_err_alike_count_for_fewer(rho: float, factor: float) -> Non
         white, last = rng.standard_normal(len(rows)), 0.0
         for i, row in enumerate(rows):
             last = z[row] = rho * last + np.sqrt(1 - rho**2) * white[i]
-    assert alike(task, z, np.ones(len(task), bool)) == pytest.approx(factor, rel=0.15, abs=0.03)
+    assert alike(task, z, np.ones(len(task), bool)) == pytest.approx(factor, rel=0.25, abs=0.06)
 
 
 def test_deviations_of_biases_hold_where_errors_last() -> None:
     # errors of 2 cm that last for a second, ten times a second: taken for white they would be three times too sure
     off = []
-    for seed in range(6):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
-        epochs = drive(150, 0.1, rng, range_sd_m=1e-3)
+        epochs = drive(120, 0.1, rng, range_sd_m=1e-3)
         state, keep = np.zeros(len(HALL)), np.exp(-0.1)
         late = []
         for epoch in epochs:

@@ -38,7 +38,7 @@ def epochs_at_rest(site: Site, rng: np.random.Generator, count: int, own: bool, 
     off_m: Floats | None = None
     for k in range(count):
         how = {"sd_m": 0.002, "rate_sd_mps": 0.01 if rates else None}
-        epoch = make_epoch(site, Drive(PLACE), 0.5 * k + 0.03 * rng.random(n), rng=rng, **how)
+        epoch = make_epoch(site, Drive(PLACE), 0.5 * k, rng=rng, **how)
         pair_sd_m = np.array(
             [next((p.bias_sd_m for p in site.pairs if (p.emitter, p.receiver) == ends), 0.0)
              for ends in zip(epoch.emitter, epoch.receiver, strict=True)]
@@ -65,29 +65,29 @@ def followed(site: Site, epochs: list[RangeEpoch], stated: bool = False) -> list
 
 def test_epochs_do_not_average_a_bias_away(rng: np.random.Generator) -> None:
     site = biased_site(level_m=PLACE[2])
-    epochs = list(epochs_at_rest(site, rng, 60, own=True))
+    epochs = list(epochs_at_rest(site, rng, 30, own=True))
     one = fix(epochs[0], site, "v")
     assert one.covariance is not None
     single_m = np.sqrt(np.diag(one.covariance)[:2])
     last = followed(site, epochs)[-1]
-    # noise of 2 mm is nothing beside 2 cm: sixty epochs say no more of the place than the first did
+    # noise of 2 mm is nothing beside 2 cm: thirty epochs say no more of the place than the first did
     np.testing.assert_allclose([last.sd("x"), last.sd("y")], single_m, rtol=0.02)
     # the same doubt taken for noise is averaged down
     noisy = site.model_copy(update={"pairs": ()})
-    assert followed(noisy, epochs)[-1].sd("x") < 0.4 * single_m[0]
+    assert followed(noisy, epochs)[-1].sd("x") < 0.6 * single_m[0]
 
 
 @pytest.mark.parametrize("rates", [False, True])
 def test_what_a_track_says_of_its_error_holds(rates: bool) -> None:
-    # squared errors over covariance of 80 runs: chi-squared of 160 degrees over 80 is 2 ± 0.22 (one sigma)
+    # squared errors over covariance of 40 runs: chi-squared of 80 degrees over 40 is 2 ± 0.32 (one sigma)
     site = biased_site(level_m=PLACE[2])
     nees = []
-    for seed in range(80):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
-        last = followed(site, list(epochs_at_rest(site, rng, 8, own=True, rates=rates)))[-1]
+        last = followed(site, list(epochs_at_rest(site, rng, 5, own=True, rates=rates)))[-1]
         off = last.position_m[:2] - PLACE[:2]
         nees.append(off @ np.linalg.solve(last.covariance[:2, :2], off))
-    assert 2 - 4 * 0.22 < np.mean(nees) < 2 + 4 * 0.22
+    assert 2 - 4 * 0.32 < np.mean(nees) < 2 + 4 * 0.32
 
 
 def test_pairs_that_are_not_stated_have_no_state(rng: np.random.Generator) -> None:
@@ -120,9 +120,7 @@ def test_a_range_less_of_an_epoch_keeps_each_pairs_bias(rng: np.random.Generator
     site = biased_site(level_m=PLACE[2])
     full = list(epochs_at_rest(site, rng, 12, own=True))
     keep = np.array([0, 2, 3, 5])
-    some = [
-        replace(rows_of(e, keep), bias_sd_m=None if e.bias_sd_m is None else e.bias_sd_m[keep]) for e in full[6:]
-    ]
+    some = [replace(rows_of(e, keep), bias_sd_m=None if e.bias_sd_m is None else e.bias_sd_m[keep]) for e in full[6:]]
     track = followed(site, full[:6] + some)
     # fewer ranges later on leave the place as well known as it was
     assert track[-1].sd("x") == pytest.approx(track[5].sd("x"), rel=0.05)

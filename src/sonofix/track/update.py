@@ -22,6 +22,9 @@ GATE_SIGMA = 5.0
 SETTLED = 1e-6
 """Iterations end when nothing in the state moves by more, in its own unit."""
 
+WHOLE_STEPS = 8
+"""Iterations after which steps are halved."""
+
 ASTRAY = 1e-3
 """Ranges are not believed where the state still moves by more when iterations have run out."""
 
@@ -94,7 +97,9 @@ def update(
             miss, crossed = measured - shown - derivative @ (belief.mean - mean), derivative @ belief.covariance
         gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
         moved = belief.mean + gain @ miss
-        last, mean = float(np.abs(moved - mean).max()), moved
+        last = float(np.abs(moved - mean).max())
+        # steps that go to and fro (a height at the beacons' own, where ranges bend most) meet half-way
+        mean = moved if k < WHOLE_STEPS or last < SETTLED else (mean + moved) / 2
         if last < SETTLED:
             break
     if last > ASTRAY and iterations > 1 and belief.about is None:
