@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonofix.ranging import RANGES_WITHOUT_SD_M, SWEEP_S, range_epoch, stated_epochs
+from sonofix.ranging import RANGES_WITHOUT_SD_M, SWEEP_S, range_epoch, stated_epochs, with_sound_speed
 from sonofix.records import Acquisition, Detection, RangeEpoch, RangeRows
 from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
@@ -165,3 +165,43 @@ def test_deviations_are_as_stated_or_that_of_radio() -> None:
 def test_no_rows_are_no_epochs() -> None:
     empty = RangeRows(np.zeros(0), (), (), np.zeros(0), None)
     assert stated_epochs(empty, site_of()) == []
+
+
+def paired(site: Site, **pair: float) -> Site:
+    return Site.model_validate({**site.model_dump(by_alias=True), "pair": [{"from": "A", "to": "N", **pair}]})
+
+
+def test_a_pairs_bias_is_taken_off_what_is_heard_and_what_is_stated() -> None:
+    site = paired(site_of(), bias_m=0.3, bias_sd_m=0.02)
+    late = [heard("A", "N", 2.0 + HALF_S + 0.01 + 2e-3), heard("A", "M", 2.0 + HALF_S + 0.01)]
+    epoch = epoch_of(site, *late)
+    at = {receiver: i for i, receiver in enumerate(epoch.receiver)}
+    assert epoch.range_m[[at["N"], at["M"]]] == pytest.approx([3.4 - 0.3, 3.4])
+    own = 4e-12 * SPEED**2
+    np.testing.assert_allclose(np.diag(epoch.covariance_m2)[[at["N"], at["M"]]], [own + 0.02**2, own])
+    assert epoch.bias_m2[[at["N"], at["M"]]] == pytest.approx([0.02**2, 0.0])
+    (stated,) = stated_epochs(rows_of([(0.0, "A", "N", 5.0), (0.0, "A", "M", 5.0)], [0.1, 0.1]), site)
+    assert stated.range_m == pytest.approx([4.7, 5.0])
+    np.testing.assert_allclose(np.diag(stated.covariance_m2), [0.01 + 0.02**2, 0.01])
+    assert stated.bias_m2 == pytest.approx([0.02**2, 0.0])
+
+
+def test_stated_ranges_are_ways_already_whatever_the_delays() -> None:
+    rows = rows_of([(0.0, "A", "N", 5.0), (0.0, "B", "M", 5.0)])
+    (epoch,) = stated_epochs(rows, site_of(delay_s=3e-3, offset_s=0.05))
+    assert epoch.range_m == pytest.approx([5.0, 5.0])
+
+
+def test_another_sound_speed_keeps_a_bias_within_its_covariance() -> None:
+    site = paired(site_of(), bias_sd_m=0.1)
+    epoch = epoch_of(site, heard("A", "N", 2.0 + HALF_S + 0.01), heard("B", "M", 2.0 + HALF_S + 0.02), speed_sd_mps=0.6)
+    slower = with_sound_speed(epoch, 0.99 * SPEED, 0.0)
+    own = 4e-12 * (0.99 * SPEED) ** 2
+    np.testing.assert_allclose(np.diag(slower.covariance_m2) - slower.bias_m2, own, rtol=1e-6)
+
+
+@pytest.mark.parametrize("synchronised", [True, False])
+def test_no_pair_is_biased_unless_stated(synchronised: bool) -> None:
+    epoch = epoch_of(site_of(synchronised), heard("A", "M", 2.02))
+    assert epoch.bias_sd_m is None
+    assert epoch.bias_m2.tolist() == [0.0]

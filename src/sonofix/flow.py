@@ -21,7 +21,7 @@ from sonofix.locate.fix import fix
 from sonofix.locate.sound_speed import SoundSpeed
 from sonofix.locate.unstated import fix_by_residuals
 from sonofix.locate.whose import tell_whose
-from sonofix.ranging import range_epoch, stated_epochs
+from sonofix.ranging import pair_biases, range_epoch, stated_epochs
 from sonofix.records import (
     Acquisition,
     Detection,
@@ -250,7 +250,7 @@ class Street:
     def __init__(self, site: Site, start: Table | None = None, rate_hz: float | None = None) -> None:
         self.site = site
         self.rate_hz = rate_hz
-        self.follower = Follower(site, Motion(), site.free_running)
+        self.follower = Follower(site, Motion(), site.free_running, gather(site, {}))
         self.air = SoundSpeed()
         self._start = start
         self._written_s: float | None = None
@@ -480,6 +480,8 @@ class Receiver:
                 why = "the warm search heard too little" if repeated else "no track says where to look"
                 given = (microphone.id, channel, first, call.windows, call.predictions)
                 sent_s = self._roll.sent_s(window, microphone.delay_s, call)
+                late_s = self._late_s(microphone.id, list(sent_s))
+                sent_s = {name: at_s + late_s[name] for name, at_s in sent_s.items()}
                 self._on_hearing(Hearing(self._plan, *given, sent_s, odd, "" if call.predictions else why))
             if not call.predictions and self._roll.ambiguous:
                 untold[microphone.id] = expectedly if repeated else ()
@@ -500,7 +502,11 @@ class Receiver:
         if untold and len(ranges):
 
             def alternatives(emitter: str, receiver: str) -> list[tuple[str, float]]:
-                return self._roll.whose(emitter, window) if receiver in untold else [(emitter, 0.0)]
+                if receiver not in untold:
+                    return [(emitter, 0.0)]
+                whose = self._roll.whose(emitter, window)
+                late_s = self._late_s(receiver, [emitter, *(other for other, _ in whose)])
+                return [(other, more + late_s[emitter] - late_s[other]) for other, more in whose]
 
             ranges, told = tell_whose(ranges, self.site, alternatives)
             events += (Event(window.sync_s, "", "whose", told),) if told else ()
@@ -516,6 +522,11 @@ class Receiver:
     def _ranges(self, window: Window, heard: tuple[Detection, ...], flags: tuple[str, ...]) -> RangeEpoch:
         acquired = Acquisition(window.index, window.sync_s, heard, flags)
         return range_epoch(self.site, self.waveforms, acquired, self.sound_speed_mps, self.sound_speed_sd_mps)
+
+    def _late_s(self, receiver: str, emitters: list[str]) -> dict[str, float]:
+        """By how much later than its way asks for each emitter's burst is heard, as the site states pairs' biases."""
+        bias_m, _ = pair_biases(self.site, emitters, (receiver,) * len(emitters))
+        return dict(zip(emitters, (bias_m / self.sound_speed_mps).tolist(), strict=True))
 
     def _watch(self, before: Belief, after: Belief) -> None:
         """Learn how briskly vehicles change speed: what the next warm search must allow for."""
@@ -534,6 +545,8 @@ class Receiver:
         aged = predict(belief, window.sync_s + float(np.mean(list(middle_s.values()))) + 0.03, self._motion(window))
         c = self._street.air.sound_speed_mps or self.sound_speed_mps
         range_m, range_sd, rate, rate_sd = expectations(aged, self.site, [(e, receiver) for e in emitters], c)
+        bias_m, bias_sd_m = pair_biases(self.site, emitters, (receiver,) * len(emitters))
+        range_m, range_sd = range_m + bias_m, np.hypot(range_sd, bias_sd_m)
         common = not self.site.clock_known
         offset_m = float(belief.mean[-2]) if common else 0.0
         # a free-running source keeps no time from burst to burst, only its speed carries over

@@ -6,7 +6,7 @@ was sent. Where the clock is not common to both ends, all ranges of an epoch sha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,8 @@ def range_epoch(
 ) -> RangeEpoch:
     """Ranges of what was heard in one epoch, in order of arrival.
 
-    ``covariance_m2`` holds each range's own variance and what all share: the sound speed's error, in proportion.
+    What the site states of a pair's bias is taken off. ``covariance_m2`` holds each range's own variance, that bias's
+    doubt, and what all share: the sound speed's error, in proportion.
     """
     heard = sorted(acquired.detections, key=lambda d: d.arrival_s)
     beacons = [site.beacon(d.emitter) for d in heard]
@@ -42,8 +43,10 @@ def range_epoch(
     time_s = np.array([d.arrival_s for d in heard]) - delay_s
     sent_s = acquired.sync_s + np.array([b.offset_s + b.delay_s + waveforms[b.id].duration_s / 2 for b in beacons])
     sent_s -= np.array([d.sent_before_s for d in heard])
-    range_m = sound_speed_mps * (time_s - sent_s)
-    own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2
+    emitter, receiver = tuple(d.emitter for d in heard), tuple(d.receiver for d in heard)
+    bias_m, bias_sd_m = pair_biases(site, emitter, receiver)
+    range_m = sound_speed_mps * (time_s - sent_s) - bias_m
+    own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2 + bias_sd_m**2
     rate = sound_speed_mps * (1.0 - np.array([d.time_scale for d in heard]))
     rate_sd = sound_speed_mps * np.sqrt([d.covariance[1, 1] for d in heard])
     common_clock = not site.clock_known
@@ -52,8 +55,8 @@ def range_epoch(
     return RangeEpoch(
         index=acquired.index,
         sync_s=acquired.sync_s,
-        emitter=tuple(d.emitter for d in heard),
-        receiver=tuple(d.receiver for d in heard),
+        emitter=emitter,
+        receiver=receiver,
         time_s=time_s,
         range_m=range_m,
         covariance_m2=np.diag(own) + shared,
@@ -64,7 +67,16 @@ def range_epoch(
         sound_speed_mps=sound_speed_mps,
         flags=acquired.flags,
         sound_speed_sd_mps=sound_speed_sd_mps,
+        bias_sd_m=bias_sd_m if bias_sd_m.any() else None,
     )
+
+
+def pair_biases(site: Site, emitter: Sequence[str], receiver: Sequence[str]) -> tuple[Floats, Floats]:
+    """By how much rows of these pairs are too long as the site states it, and its deviation, (n,) each in m."""
+    stated = {(p.emitter, p.receiver): (p.bias_m, p.bias_sd_m) for p in site.pairs}
+    found = [stated.get(pair, (0.0, 0.0)) for pair in zip(emitter, receiver, strict=True)]
+    bias_m, sd_m = np.array(found, float).reshape(-1, 2).T.copy()
+    return bias_m, sd_m
 
 
 def flights_m(range_m: Floats, common_clock: bool) -> Floats:
@@ -89,11 +101,16 @@ def with_sound_speed(epoch: RangeEpoch, sound_speed_mps: float, sound_speed_sd_m
         range_rate_sd_mps=None if rate_sd is None else scale * rate_sd,
         sound_speed_mps=sound_speed_mps,
         sound_speed_sd_mps=sound_speed_sd_mps,
+        bias_sd_m=None if epoch.bias_sd_m is None else scale * epoch.bias_sd_m,
     )
 
 
 def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
-    """Epochs of ranges that a recording states: one sweep over the pairs each, until a pair comes again."""
+    """Epochs of ranges that a recording states: one sweep over the pairs each, until a pair comes again.
+
+    What the site states of a pair's bias is taken off. Delays are not: a stated range is a way already. Whoever
+    measured it knew when the burst left and was heard; delays say when the site's own schedule lets it sound.
+    """
     epochs: list[RangeEpoch] = []
     order = np.argsort(rows.time_s, kind="stable")
     sweep: list[int] = []
@@ -101,11 +118,14 @@ def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
 
     c = site.sound_speed_mps
     speed_sd_mps = float(np.hypot(rows.speed_sd_mps, TIMES_SD * c)) if rows.speed_sd_mps else 0.0
+    bias_m, bias_sd_m = pair_biases(site, rows.emitter, rows.receiver)
+    range_m = rows.range_m - bias_m
+    sds_m = np.full(len(range_m), np.nan) if rows.sd_m is None else rows.sd_m
+    own_m2 = np.where(np.isnan(sds_m), RANGES_WITHOUT_SD_M, sds_m) ** 2 + bias_sd_m**2
 
     def close() -> None:
         at = np.array(sweep)
-        flight_m = flights_m(rows.range_m[at], not site.clock_known) * (speed_sd_mps / c)
-        sd = np.full(len(at), np.nan) if rows.sd_m is None else rows.sd_m[at]
+        flight_m = flights_m(range_m[at], not site.clock_known) * (speed_sd_mps / c)
         epochs.append(
             RangeEpoch(
                 index=len(epochs),
@@ -113,16 +133,16 @@ def stated_epochs(rows: RangeRows, site: Site) -> list[RangeEpoch]:
                 emitter=tuple(rows.emitter[i] for i in sweep),
                 receiver=tuple(rows.receiver[i] for i in sweep),
                 time_s=rows.time_s[at],
-                range_m=rows.range_m[at],
-                covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2)
-                + np.outer(flight_m, flight_m),
+                range_m=range_m[at],
+                covariance_m2=np.diag(own_m2[at]) + np.outer(flight_m, flight_m),
                 range_rate_mps=None,
                 range_rate_sd_mps=None,
                 snr_db=None,
                 clock="known" if site.clock_known else "common",
                 sound_speed_mps=c,
                 sound_speed_sd_mps=speed_sd_mps,
-                sd_stated=not np.isnan(sd).any(),
+                sd_stated=not np.isnan(sds_m[at]).any(),
+                bias_sd_m=bias_sd_m[at] if bias_sd_m.any() else None,
             )
         )
 

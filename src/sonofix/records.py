@@ -226,6 +226,9 @@ class RangeEpoch:
         Its deviation, which ``covariance_m2`` holds as what all ranges share; 0: taken as it is.
     sd_stated : bool
         False where nobody stated how good ranges are, so that ``covariance_m2`` holds an assumption.
+    bias_sd_m : float64 (n,) or None
+        Deviation of what the site file states that each pair's ranges err by, which ``covariance_m2`` holds: one error
+        of a pair for all epochs; None: no pair has any.
     """
 
     index: int
@@ -243,10 +246,16 @@ class RangeEpoch:
     flags: tuple[str, ...] = ()
     sound_speed_sd_mps: float = 0.0
     sd_stated: bool = True
+    bias_sd_m: Floats | None = None
 
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.emitter)
+
+    @property
+    def bias_m2(self) -> Floats:
+        """Variance (n,) of the errors that stay with the rows' pairs."""
+        return np.zeros(len(self)) if self.bias_sd_m is None else self.bias_sd_m**2
 
 
 @dataclass(frozen=True, slots=True, eq=False)

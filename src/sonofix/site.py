@@ -309,14 +309,35 @@ class Microphone(_Section):
         yield from _mounting(get, "microphone")
 
 
+class Pair(_Section):
+    """`[[pair]]`: ranges from beacon `from` to microphone `to` are `bias_m` too long, known to `bias_sd_m`.
+
+    That error stays as it is for the whole recording, whatever the way. In Python the two are `emitter` and `receiver`.
+    """
+
+    model_config = ConfigDict(populate_by_name=False)
+
+    emitter: Id = Field(alias="from")
+    receiver: Id = Field(alias="to")
+    bias_m: Number = 0.0
+    bias_sd_m: NotNegative = 0.0
+
+    @classmethod
+    def _broken_rules(cls, get: Callable[[str], Any]) -> Iterator[Mistake]:
+        if get("bias_m") is None and get("bias_sd_m") is None:
+            remedy = "the pair tells nothing: give how much its ranges are too long, its deviation bias_sd_m, or both"
+            yield ("bias_m",), None, remedy
+
+
 _Node = TypeVar("_Node", Vehicle, Beacon, Microphone)
 
 
 class Site(_Section):
     """All of `site.toml`.
 
-    The file's tables `[site]`, `[[vehicle]]`, `[[beacon]]` and `[[microphone]]` are the attributes `section`,
-    `vehicles`, `beacons` and `microphones`; a Site can be built by both names, and with `name` and `bounds_m` directly.
+    The file's tables `[site]`, `[[vehicle]]`, `[[beacon]]`, `[[microphone]]` and `[[pair]]` are the attributes
+    `section`, `vehicles`, `beacons`, `microphones` and `pairs`; a Site can be built by both names, and with `name` and
+    `bounds_m` directly.
     `Site.model_json_schema()` describes the file for editors.
     """
 
@@ -329,6 +350,7 @@ class Site(_Section):
     vehicles: tuple[Vehicle, ...] = Field(default=(), alias="vehicle")
     beacons: tuple[Beacon, ...] = Field(default=(), alias="beacon")
     microphones: tuple[Microphone, ...] = Field(default=(), alias="microphone")
+    pairs: tuple[Pair, ...] = Field(default=(), alias="pair")
 
     @model_validator(mode="before")
     @classmethod
@@ -355,6 +377,7 @@ class Site(_Section):
                     known = ", ".join(vehicles) or "none"
                     remedy = f"no [[vehicle]] has this id (known: {known}); add it or correct the name"
                     yield (kind, i, "vehicle"), vehicle, remedy
+        yield from _pair_rules(_rows(get("pair"), get("pairs")), kinds["beacon"], kinds["microphone"])
         yield from _code_rules(kinds["beacon"], get("schedule"), get("signal"))
 
     @property
@@ -435,6 +458,9 @@ def _find(nodes: tuple[_Node, ...], node_id: str, kind: str) -> _Node:
     raise KeyError(f"no {kind} {node_id!r}; the site has {', '.join(node.id for node in nodes) or 'none'}")
 
 
+_PAIR_KEYS = (("from", "emitter"), ("to", "receiver"))
+
+
 def _is_vector(value: object) -> bool:
     return isinstance(value, list | tuple) and len(value) == 3 and all(isinstance(v, int | float) for v in value)
 
@@ -457,6 +483,25 @@ def _twice(kind: str, rows: list[Callable[[str], Any]], key: str, remedy: str) -
         value = row(key)
         if isinstance(value, str | int) and first.setdefault(value, i) != i:
             yield (kind, i, key), value, f"{kind} {first[value] + 1} has it already; {remedy}"
+
+
+def _pair_rules(
+    pairs: list[Callable[[str], Any]], beacons: list[Callable[[str], Any]], microphones: list[Callable[[str], Any]]
+) -> Iterator[Mistake]:
+    """Pairs name a beacon and a microphone that are there, and no two of them the same ones."""
+    first: dict[tuple[str, str], int] = {}
+    for i, row in enumerate(pairs):
+        names = tuple(row(key) if row(key) is not None else row(field) for key, field in _PAIR_KEYS)
+        for (key, _), name, kind, nodes in zip(
+            _PAIR_KEYS, names, ("beacon", "microphone"), (beacons, microphones), strict=True
+        ):
+            ids = sorted(str(node("id")) for node in nodes)
+            if isinstance(name, str) and name not in ids:
+                known = ", ".join(ids) or "none"
+                yield ("pair", i, key), name, f"no [[{kind}]] has this id (known: {known}); correct the name"
+        if all(isinstance(name, str) for name in names) and first.setdefault(names, i) != i:
+            remedy = f"pair {first[names] + 1} is from {names[0]} to {names[1]} already; state each pair once"
+            yield ("pair", i, "from"), names[0], remedy
 
 
 def _code_rules(beacons: list[Callable[[str], Any]], schedule: object, signal: object) -> Iterator[Mistake]:

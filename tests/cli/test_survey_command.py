@@ -13,6 +13,7 @@ from sonofix.cli.main import app
 from sonofix.files import RecordingError, read_site, write_recording
 from sonofix.files.site_file import site_text
 from sonofix.files.survey_writing import check_targets
+from sonofix.flow import run
 from sonofix.records import RangeRows, Recording
 from sonofix.signals.codes import primitive_taps
 from sonofix.signals.waveform import waveforms_of
@@ -239,3 +240,45 @@ def test_a_straight_drive_of_unknown_level_is_surveyed_as_far_as_it_goes(tmp_pat
     for beacon in values["beacons"]:
         off = np.array(beacon["position_m"]) - PLACES[beacon["id"]]
         assert np.all(np.abs(off) < 5 * float(guess_sd))
+
+
+def test_biases_of_pairs_are_found_written_and_taken_off_again(tmp_path) -> None:
+    biases_m = np.array([0.12, 0.25, 0.18, 0.3, 0.07])
+    site = Site.model_validate(hall(0.0))
+    rng = np.random.default_rng(8)
+    epochs = 80
+    time_s = np.repeat(np.arange(epochs) * 0.4, len(PLACES))
+    true = np.tile(np.array(list(PLACES.values())), (epochs, 1))
+    range_m = np.linalg.norm(way(time_s) + [0, 0, 0.4] - true, axis=1) + np.tile(biases_m, epochs)
+    rows = RangeRows(time_s, tuple(PLACES) * epochs, ("M1",) * len(time_s),
+                     range_m + rng.normal(0, 0.01, len(time_s)), np.full(len(time_s), 0.01))  # fmt: skip
+    folder = tmp_path / "rec"
+    write_recording(folder, Recording(site, ranges=rows), {})
+    out = tmp_path / "new.toml"
+    told = runner.invoke(app, ["survey", str(folder), "--biases", "pair", "-o", str(out), "--no-plot"])
+    assert told.exit_code == 0, told.stderr
+    found = read_site(out)
+    assert [(p.emitter, p.receiver) for p in found.pairs] == [(name, "M1") for name in PLACES]
+    off = np.array([p.bias_m for p in found.pairs]) - biases_m
+    sd_m = np.array([p.bias_sd_m for p in found.pairs])
+    assert np.abs(off).max() < 0.02
+    assert np.abs(off / sd_m).max() < 4.5
+
+    def miss_m(placed: Site, what: str) -> float:
+        squares = []
+        for step in run(Recording(placed, ranges=rows)):
+            for told in step.fixes if what == "fixes" else step.estimates:
+                if told.position_m is not None:
+                    squares.append(np.sum((told.position_m[:2] - way(np.array([told.time_s]))[0, :2]) ** 2))
+        assert len(squares) > 0.8 * epochs
+        return float(np.sqrt(np.mean(squares)))
+
+    assert miss_m(found, "fixes") < 0.02 < 0.06 < miss_m(site, "fixes")
+    assert miss_m(found, "track") < 0.02
+    # once more, with the new file: nothing is left to find, and what was found stays
+    (folder / "site.toml").write_text(out.read_text())
+    again = tmp_path / "again.toml"
+    told = runner.invoke(app, ["survey", str(folder), "--biases", "pair", "-o", str(again), "--no-plot"])
+    assert told.exit_code == 0, told.stderr
+    both = [np.array([p.bias_m for p in read_site(path).pairs]) for path in (out, again)]
+    np.testing.assert_allclose(both[0], both[1], atol=0.003)

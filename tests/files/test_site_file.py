@@ -21,6 +21,7 @@ from sonofix.site import (
     Microphone,
     MSequenceCode,
     Origin,
+    Pair,
     ReferenceCode,
     Schedule,
     Signal,
@@ -144,3 +145,50 @@ def test_the_schema_knows_every_key():
         assert set(model.model_fields) <= known
     assert {"site", "beacon", "microphone", "vehicle", "format"} <= set(schema["properties"])
     assert "null" not in schema_text()
+
+
+PAIRED = (
+    GOOD
+    + """
+[[microphone]]
+id = "M"
+position_m = [1, 2, 3]
+[[pair]]
+from = "B"
+to = "M"
+"""
+)
+
+
+def test_a_pairs_bias_is_read_and_written_back():
+    site = parse_site(PAIRED + "bias_m = 0.2\nbias_sd_m = 0.01\n")
+    assert site.pairs == (Pair.model_validate({"from": "B", "to": "M", "bias_m": 0.2, "bias_sd_m": 0.01}),)
+    assert parse_site(site_text(site)) == site
+    # 0 is what a key is that is left out, but one of the two is stated
+    known = parse_site(PAIRED + "bias_m = 0.0\n")
+    assert known.pairs[0].bias_sd_m == 0.0
+    assert parse_site(site_text(known)) == known
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("bias_m = nan\n", "pair 1 bias_m = nan: must be finite"),
+        ("bias_m = 0.1\nbias_sd_m = -0.1\n", "pair 1 bias_sd_m = -0.1: must be greater than or equal to 0"),
+        ("bias_m = '0.1'\n", "must be a number"),
+        ("", "pair 1 bias_m: the pair tells nothing: give"),
+        ("bias_m = 0.1\nbias = 2\n", "pair 1 bias = 2: unknown key; did you mean bias_m"),
+        ("bias_m = 0.1\nemitter = 'B'\n", "pair 1 emitter"),
+        (
+            "bias_m = 0.1\n[[pair]]\nfrom = 'C'\nto = 'M'\nbias_m = 0.1\n",
+            'pair 2 from = "C": no [[beacon]] has this id',
+        ),
+        ("bias_m = 0.1\n[[pair]]\nfrom = 'B'\nto = 'N'\nbias_m = 0.1\n", "(known: M); correct the name"),
+        ("bias_m = 0.1\n[[pair]]\nfrom = 'B'\nto = 'M'\nbias_m = 0.2\n", "pair 1 is from B to M already"),
+        ("bias_m = 0.1\n[[pair]]\nto = 'M'\nbias_m = 0.2\n", "pair 2 from: is missing; add it"),
+    ],
+)
+def test_mistakes_in_pairs_name_field_value_and_remedy(text, told):
+    lines = problems(PAIRED + text)
+    assert len(lines) == 1
+    assert told in lines[0]

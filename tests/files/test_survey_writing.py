@@ -9,6 +9,7 @@ from sonofix.files import RecordingError
 from sonofix.files.site_file import parse_site
 from sonofix.files.survey_writing import check_targets, corrected_text, survey_values, write_site, write_survey
 from sonofix.records import OpenDirection, PairBias, Survey, SurveyedBeacon
+from sonofix.site import Pair
 
 TEXT = """# our hall
 format = 1
@@ -114,3 +115,28 @@ def test_json_holds_the_covariance_and_null_for_unknown(tmp_path) -> None:
     assert read["beacons"][0]["sd_m"] == pytest.approx([1e-3] * 3)
     assert read["unknown"][0]["drive_sd_m"] is None
     assert read["residual_before_m"] is None
+
+
+PAIR = """
+[[pair]]  # by the tape
+to = "M1"
+from = "B1"
+bias_m = 0.1  # roughly
+"""
+
+
+def test_biases_change_where_they_stand_and_new_ones_are_added() -> None:
+    before = parse_site(TEXT + PAIR)
+    first = before.pairs[0].model_copy(update={"bias_m": 0.15, "bias_sd_m": 0.004})
+    second = Pair.model_validate({"from": "B2", "to": "M1", "bias_m": -0.02, "bias_sd_m": 0.003})
+    after = changed(before).model_copy(update={"pairs": (first, second)})
+    text = corrected_text(TEXT + PAIR, before, after)
+    assert parse_site(text) == after
+    assert "[[pair]]  # by the tape" in text
+    assert "bias_m = 0.15  # roughly" in text
+    assert text.rstrip().endswith("bias_sd_m = 0.003")
+    # without a line's end, too
+    bare = parse_site(TEXT)
+    assert parse_site(corrected_text(TEXT.rstrip(), bare, bare.model_copy(update={"pairs": (second,)}))).pairs == (
+        second,
+    )

@@ -134,7 +134,7 @@ def test_errors_age_to_what_is_known_of_their_variance() -> None:
     known = stated.trust(3)
     n = stated.size(3)
     mean, covariance, free = np.zeros(n), np.zeros((n, n)), np.zeros(n, bool)
-    stated.begin(mean, covariance, free, 0, 3)
+    stated.begin(mean, covariance, free, 0, np.full(3, np.nan))
     mean[stated.COMMON :] = 1.0
     covariance[stated.COMMON :, stated.COMMON :] *= 0.1
     stated.wander(mean, covariance, 0, known, 1e6)

@@ -26,8 +26,9 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "vehicle": models.Vehicle,
     "beacon": models.Beacon,
     "microphone": models.Microphone,
+    "pair": models.Pair,
 }
-LISTS = ("vehicle", "beacon", "microphone")
+LISTS = ("vehicle", "beacon", "microphone", "pair")
 CODES: dict[str, type[BaseModel]] = {
     "m-sequence": models.MSequenceCode,
     "gold": models.GoldCode,
@@ -200,13 +201,18 @@ def _unknown(key: str, where: tuple[str | int, ...]) -> str:
         known = ("format", *SECTIONS)
     else:
         model = CODES[str(where[3])] if where[2:3] == ("code",) else SECTIONS[str(where[0])]
-        known = tuple(model.model_fields)
-    homes = [name for name, model in SECTIONS.items() if key in model.model_fields]
+        known = _keys(model)
+    homes = [name for name, model in SECTIONS.items() if key in _keys(model)]
     near = did_you_mean(key, known)
     if homes and not near.startswith("did"):
         brackets = " or ".join(f"[[{home}]]" if home in LISTS else f"[{home}]" for home in homes)
         return f"unknown key here; it belongs in {brackets}"
     return f"unknown key; {near}"
+
+
+def _keys(model: type[BaseModel]) -> tuple[str, ...]:
+    """Return the keys of a table as the file has them."""
+    return tuple(info.alias or name for name, info in model.model_fields.items())
 
 
 def _field(raw: Mapping[str, Any], loc: tuple[str | int, ...]) -> str:
@@ -248,11 +254,19 @@ def site_text(site: Site) -> str:
         if part is None:
             continue
         for table in part if isinstance(part, tuple) else (part,):
-            lines += ["", f"[[{key}]]" if isinstance(part, tuple) else f"[{key}]"]
-            values = table.model_dump(exclude_none=True, exclude_defaults=key in LISTS)
-            if key == "beacon" and table.code is not None:
-                values["code"] = table.code.model_dump(exclude_none=True)
-            lines += [f"{name} = {_toml(value)}" for name, value in values.items()]
+            lines += ["", table_text(key, table).rstrip("\n")]
+    return "\n".join(lines) + "\n"
+
+
+def table_text(key: str, table: BaseModel) -> str:
+    """Return one table of a site file, ``[key]`` or ``[[key]]`` and its lines."""
+    lines = [f"[[{key}]]" if key in LISTS else f"[{key}]"]
+    values = table.model_dump(by_alias=True, exclude_none=True, exclude_defaults=key in LISTS)
+    if isinstance(table, Beacon) and table.code is not None:
+        values["code"] = table.code.model_dump(exclude_none=True)
+    if isinstance(table, models.Pair) and not {"bias_m", "bias_sd_m"} & set(values):
+        values["bias_m"] = table.bias_m
+    lines += [f"{name} = {_toml(value)}" for name, value in values.items()]
     return "\n".join(lines) + "\n"
 
 

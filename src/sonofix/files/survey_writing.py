@@ -12,14 +12,14 @@ from typing import Any
 
 from sonofix.files.audio import CAPTURE_NAMES
 from sonofix.files.problem import Problem, RecordingError
-from sonofix.files.site_file import FILE_NAME, parse_site, site_text
+from sonofix.files.site_file import FILE_NAME, parse_site, site_text, table_text
 from sonofix.files.tables import LAYOUTS
 from sonofix.files.writing import told, write_text, write_whole
 from sonofix.records import Survey
-from sonofix.site import Beacon, Microphone, ReferenceCode, Site
+from sonofix.site import Beacon, Microphone, Pair, ReferenceCode, Site
 
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([A-Za-z0-9_.\-\"' ]+?)\s*\]\]?\s*(#.*)?$")
-_KEYS = ("position_m", "position_sd_m", "delay_s")
+_KEYS = ("position_m", "position_sd_m", "delay_s", "bias_m", "bias_sd_m")
 
 
 def check_targets(targets: Mapping[str, Path], folder: Path, site: Site, replacing: bool) -> None:
@@ -79,10 +79,10 @@ def _try(path: Path) -> None:
 
 
 def corrected_text(text: str, before: Site, after: Site) -> str:
-    """Return a site file's text with its fixed beacons' places, deviations and delays as ``after`` has them.
+    """Return a site file's text with its fixed beacons' places, deviations, delays and biases as ``after`` has them.
 
-    Comments, order and everything else stay. Where the text is written in a way that cannot be edited line by line, the
-    whole is written anew, without comments.
+    Comments, order and everything else stay; pairs that are new stand at the end. Where the text is written in a way
+    that cannot be edited line by line, the whole is written anew, without comments.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def corrected_text(text: str, before: Site, after: Site) -> str:
         They may differ in these values alone.
     """
     lines = text.splitlines(keepends=True)
-    seen = {"beacon": 0, "microphone": 0}
+    seen = {"beacon": 0, "microphone": 0, "pair": 0}
     out: list[str] = []
     pending: dict[str, str] = {}
     at = 0
@@ -106,7 +106,7 @@ def corrected_text(text: str, before: Site, after: Site) -> str:
                 number = seen[header[2]]
                 seen[header[2]] += 1
                 old, new = (getattr(site, f"{header[2]}s") for site in (before, after))
-                if number < len(new):
+                if number < len(old):
                     pending = _changes(old[number], new[number])
         key = re.match(r"^\s*([A-Za-z0-9_]+)\s*=", line)
         if key and key[1] in pending:
@@ -121,6 +121,9 @@ def corrected_text(text: str, before: Site, after: Site) -> str:
         at += 1
     _add(out, pending)
     edited = "".join(out)
+    for pair in after.pairs[len(before.pairs) :]:
+        edited += "" if edited.endswith("\n") else "\n"
+        edited += "\n" + table_text("pair", pair)
     try:
         if parse_site(edited) == after:
             return edited
@@ -129,8 +132,8 @@ def corrected_text(text: str, before: Site, after: Site) -> str:
     return site_text(after)
 
 
-def _changes(old: Beacon | Microphone, new: Beacon | Microphone) -> dict[str, str]:
-    """Keys of one beacon or microphone that differ, as TOML."""
+def _changes(old: Beacon | Microphone | Pair, new: Beacon | Microphone | Pair) -> dict[str, str]:
+    """Keys of one beacon, microphone or pair that differ, as TOML."""
     out = {}
     for key in _KEYS:
         value = getattr(new, key, None)

@@ -177,4 +177,5 @@ def _as(epoch: RangeEpoch, rows: list[tuple[int, str, float]]) -> RangeEpoch:
         range_rate_mps=None if epoch.range_rate_mps is None else epoch.range_rate_mps[at],
         range_rate_sd_mps=None if epoch.range_rate_sd_mps is None else epoch.range_rate_sd_mps[at],
         snr_db=None if epoch.snr_db is None else epoch.snr_db[at],
+        bias_sd_m=None if epoch.bias_sd_m is None else epoch.bias_sd_m[at],
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats, OpenDirection, PairBias, Survey, SurveyedBeacon
 from sonofix.site import Site
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
 FEW_ROWS = 8
 MOST_EVENTS = 40
+
+TOLD_ALIKE = 1.5
+"""Ranges in a row that err alike, from which that is said."""
 
 
 def conclude(site: Site, task: Task, fit: Fit, wishes: Wishes, before_m: float, rival: Fit | None) -> Survey:
@@ -32,7 +36,7 @@ def conclude(site: Site, task: Task, fit: Fit, wishes: Wishes, before_m: float, 
     drive, p = task.drive, 3 * len(task.movable)
     free = gauge.freedom_of(drive, task.movable, fit.guess.place_m)
     guess = fit.guess
-    full, inflation = _covariance(task, fit)
+    full, inflation, together = _covariance(task, fit)
     raw = full[:p, :p]
     away = np.eye(p) - free.basis @ free.basis.T
     shape = away @ raw @ away
@@ -94,7 +98,7 @@ def conclude(site: Site, task: Task, fit: Fit, wishes: Wishes, before_m: float, 
         after_m=_rms(residual[0][used]),
         rate_after_mps=_rms(rates),
         inflation=max(inflation, fit.scale[0]),
-        events=_events(task, fit),
+        events=_events(task, fit, together),
     )
 
 
@@ -121,8 +125,11 @@ def _rms(residual: Floats) -> float:
     return float(np.sqrt(np.mean(residual**2))) if len(residual) else float("nan")
 
 
-def _covariance(task: Task, fit: Fit) -> tuple[Floats, float]:
-    """Covariance (g, g) of the shared unknowns, rigid motions that nothing holds left out; and its inflation."""
+def _covariance(task: Task, fit: Fit) -> tuple[Floats, float, float]:
+    """Covariance (g, g) of the shared unknowns, rigid motions that nothing holds left out.
+
+    And how much its deviations are inflated, since residuals are larger than stated; and its variances, by `alike`.
+    """
     drive = task.drive
     z = fit.residual / np.stack([drive.range_sd_m * fit.scale[0], drive.rate_sd_mps * fit.scale[1]])
     z = z[:, fit.used]
@@ -136,7 +143,36 @@ def _covariance(task: Task, fit: Fit) -> tuple[Floats, float]:
     size, axes = np.linalg.eigh(held * unit[:, None] * unit[None, :])
     size = np.maximum(size, 1e-14)
     covariance = unit[:, None] * (axes / size) @ axes.T * unit[None, :]
-    return covariance * inflation**2, inflation
+    together = alike(drive, z[0], fit.used)
+    return covariance * inflation**2 * together, inflation, together
+
+
+def alike(drive: Drive, z: Floats, used: NDArray[np.bool_]) -> float:
+    """Return how many ranges in a row err alike: by so much fewer they count (Bartlett 1935), 1 where each is alone.
+
+    That is the sum of the autocorrelation of each pair's residuals, all pairs together, up to where it is lost in
+    noise: walls and antennas err for seconds, and what a bias or a scale leaves over stays while the way is alike.
+
+    Parameters
+    ----------
+    z : float64 (m,)
+        Whitened residuals of the ranges used.
+    used : bool (n,)
+    """
+    rows = np.flatnonzero(used)
+    ends = [(drive.emitter[i], drive.receiver[i]) for i in rows]
+    number = {pair: i for i, pair in enumerate(dict.fromkeys(ends))}
+    pair = np.array([number[p] for p in ends], np.int64)
+    order = np.lexsort((drive.time_s[rows], pair))
+    z, pair = z[order], pair[order]
+    total, power = 1.0, float(np.mean(z**2)) if len(z) else 0.0
+    for lag in range(1, len(z) // max(2 * len(number), 1)):
+        same = pair[lag:] == pair[:-lag]
+        together = float(np.mean((z[lag:] * z[:-lag])[same])) / max(power, 1e-30)
+        if together < 3.0 / np.sqrt(np.count_nonzero(same)):
+            break
+        total += 2.0 * together
+    return total
 
 
 def _beacons(
@@ -278,9 +314,12 @@ def _way(site: Site, drive: Drive, states: Floats) -> dict[str, Floats]:
     return out
 
 
-def _events(task: Task, fit: Fit) -> tuple[Event, ...]:
-    """Tell of rows left out, a beacon an event, and of rows that a survey does not take."""
+def _events(task: Task, fit: Fit, together: float) -> tuple[Event, ...]:
+    """Tell of rows that err alike, of those left out, a beacon an event, and of those that a survey does not take."""
     drive, events = task.drive, []
+    if together > TOLD_ALIKE:
+        text = f"a pair's ranges err alike: {together:.1f} in a row tell as much as one; deviations are so widened"
+        events.append(Event(0.0, "", "alike", text))
     for name in dict.fromkeys(drive.names[i] for i in drive.point):
         mine = np.array([drive.names[i] == name for i in drive.point])
         out = np.flatnonzero(mine & ~fit.used)

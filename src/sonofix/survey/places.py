@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.ranging import with_sound_speed
-from sonofix.records import Floats, RangeEpoch, Survey
+from sonofix.records import Event, Floats, RangeEpoch, Survey
 from sonofix.site import Beacon, Site
 from sonofix.survey import gauge
 from sonofix.survey.begin import from_ranges, placed_states, untellable
@@ -39,6 +39,12 @@ DRIFT = 1e-4
 
 WARMING_MPS2 = 1e-6
 """Deviation of a clock's drift's change: a crystal that warms up by 0.2 ppm a minute."""
+
+MOST_ROWS = 12_000
+"""Ranges that an adjustment takes: of more, epochs are left out as long as those that stay are close together."""
+
+CLOSE_S = 0.5
+"""Between epochs so close a vehicle is followed without losing it."""
 
 STRAYED = 0.3
 """Share of rows left out from which a beginning is doubted."""
@@ -96,6 +102,7 @@ def survey(
     wishes = wishes or Wishes()
     if wishes.speed_sd_mps is None:
         wishes = replace(wishes, speed_sd_mps=max((e.sound_speed_sd_mps for e in epochs), default=0.0))
+    epochs, told = thinned(epochs)
     # its error is an unknown here, and no noise that ranges share
     epochs = [with_sound_speed(e, e.sound_speed_mps, 0.0) for e in epochs]
     drive = gather(site, epochs)
@@ -132,7 +139,31 @@ def survey(
         fit, rival = rival, fit
     if rival is not None and rival.chi2 > fit.chi2 + UNDECIDED_CHI2:
         rival = None
-    return conclude(site, task, fit, wishes, before_m, rival)
+    found_all = conclude(site, task, fit, wishes, before_m, rival)
+    return replace(found_all, events=(*told, *found_all.events))
+
+
+def thinned(epochs: Sequence[RangeEpoch]) -> tuple[list[RangeEpoch], tuple[Event, ...]]:
+    """Leave epochs out where there are more ranges than an adjustment needs; say so.
+
+    Of each k epochs in a row one stays, drawn at random, so that no order in which beacons take turns falls in
+    step with it. Ranges a fraction of a second apart err much alike, so little is lost; deviations are those of what
+    stays.
+    """
+    rows = sum(len(e) for e in epochs)
+    most = 1 + int(CLOSE_S / max(_spacing_s(epochs), 1e-9))
+    k = min(-(-rows // MOST_ROWS), most)
+    if k <= 1:
+        return list(epochs), ()
+    rng = np.random.default_rng(0)
+    kept = [epochs[min(i + int(rng.integers(k)), len(epochs) - 1)] for i in range(0, len(epochs), k)]
+    text = f"{rows} ranges in {len(epochs)} epochs are more than it takes: of each {k} epochs in a row one was taken"
+    return kept, (Event(epochs[0].sync_s, "", "thinned", text),)
+
+
+def _spacing_s(epochs: Sequence[RangeEpoch]) -> float:
+    """Return the median time between epochs; infinite where there is but one."""
+    return float(np.median(np.diff([e.sync_s for e in epochs]))) if len(epochs) > 1 else np.inf
 
 
 def _rms(residual: Floats) -> float:

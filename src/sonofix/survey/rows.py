@@ -149,7 +149,8 @@ def gather(site: Site, epochs: Sequence[RangeEpoch]) -> Drive:
                 "dt": epoch.time_s[rows] - middle_s,
                 "time_s": epoch.time_s[rows],
                 "range_m": epoch.range_m[rows],
-                "range_sd_m": np.sqrt(np.diag(epoch.covariance_m2)[rows]),
+                # what stays with a pair is an unknown here, and no noise
+                "range_sd_m": np.sqrt(np.diag(epoch.covariance_m2)[rows] - epoch.bias_m2[rows]),
                 "rate_mps": nothing if epoch.range_rate_mps is None else epoch.range_rate_mps[rows],
                 "rate_sd_mps": nothing if epoch.range_rate_sd_mps is None else epoch.range_rate_sd_mps[rows],
                 "epoch": np.full(len(rows), index),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sonofix.records import RangeEpoch, Survey
-from sonofix.site import Site
+from sonofix.site import Pair, Site
 
 NOWHERE_M = 1000.0
 """Deviation at which a beacon's place tells nothing, so that no fix comes of it and every search is cold."""
@@ -69,12 +69,13 @@ def corrected(site: Site, found: Survey, delays: bool) -> Site:
         As the survey took it.
     found : Survey
     delays : bool
-        Whether biases become delays: where ranges were made with the site's delays. A beacon's bias is added to its
-        ``delay_s``, since it sounds so much later.
+        Whether biases of beacons become delays: where ranges were made with the site's delays. A beacon's bias is added
+        to its ``delay_s``, since it sounds so much later.
 
     Notes
     -----
-    A beacon's ``position_sd_m`` becomes its largest deviation along any direction, within the survey's frame.
+    A beacon's ``position_sd_m`` becomes its largest deviation along any direction, within the survey's frame. Biases of
+    pairs are added to what the site states of theirs, which was taken off the ranges; pairs not surveyed stay.
     """
     by_id = {beacon.id: beacon for beacon in found.beacons}
     beacons = []
@@ -95,7 +96,20 @@ def corrected(site: Site, found: Survey, delays: bool) -> Site:
         else m
         for m in site.microphones
     )
-    return site.model_copy(update={"beacons": tuple(beacons), "microphones": microphones})
+    update = {"beacons": tuple(beacons), "microphones": microphones, "pairs": _paired(site, found)}
+    return site.model_copy(update=update)
+
+
+def _paired(site: Site, found: Survey) -> tuple[Pair, ...]:
+    pairs = {(p.emitter, p.receiver): p for p in site.pairs}
+    for p in found.pairs:
+        if not p.emitter:
+            continue
+        key = (p.emitter, p.receiver)
+        bias_m = round((pairs[key].bias_m if key in pairs else 0.0) + p.bias_m, 4) + 0.0
+        sd_m = round(float(np.ceil(p.sd_m / GRAIN_M)) * GRAIN_M, 4)
+        pairs[key] = Pair.model_validate({"from": p.emitter, "to": p.receiver, "bias_m": bias_m, "bias_sd_m": sd_m})
+    return tuple(pairs.values())
 
 
 def without_biases(epoch: RangeEpoch, found: Survey) -> RangeEpoch:

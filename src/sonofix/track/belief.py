@@ -12,7 +12,7 @@ from sonofix.geometry import PITCH, POSE, ROLL, SIZE, YAW, from_arm, open_arms, 
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
-from sonofix.track import gyro, stated, steps, wheels
+from sonofix.track import gyro, paired, stated, steps, wheels
 from sonofix.track.anchor import lift
 from sonofix.track.inputs import GYRO, STEP, WHEELS, Inputs
 from sonofix.track.stated import Trust
@@ -22,7 +22,8 @@ SOUND_SPEED_MPS = 343.0
 """Near enough to turn a clock's speed into m/s."""
 
 LOOSE = 0.5
-"""Deviation in m and rad with which a place is taken that ranges stated by others gave: they speak again at once."""
+"""Deviation in m and rad with which a place is taken that ranges with errors of their own gave: they speak again at
+once."""
 
 INSTANT_S = 1e-9
 """Instants that differ by less are one: nothing moves meanwhile."""
@@ -133,7 +134,9 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
             for slot in slots[slots >= 0]:
                 room.begin(covariance, free, int(slot))
         if inputs.range_slot >= 0:
-            stated.begin(mean, covariance, free, inputs.range_slot, len(inputs.pairs))
+            stated.begin(mean, covariance, free, inputs.range_slot, inputs.known_sd_m)
+        if inputs.bias_slot >= 0:
+            paired.begin(covariance, free, inputs.bias_slot, inputs.known_sd_m)
     trust = stated.trust(len(inputs.pairs)) if inputs is not None and inputs.range_slot >= 0 else None
     placed = np.zeros(len(site.vehicles), bool)
     return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site), trust=trust)
@@ -279,9 +282,9 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
 
 
 def loosen(belief: Belief, vehicle: int) -> Belief:
-    """Return a belief in which a fix only says where a vehicle's track begins: it knew nothing of shared errors."""
+    """Return a belief in which a fix only says where a vehicle's track begins: it knew nothing of lasting errors."""
     covariance, at = belief.covariance.copy(), SIZE * vehicle
-    for i in range(at, at + YAW + 1):
+    for i in (*range(at, at + YAW + 1), -2):
         covariance[i, i] += LOOSE**2 if belief.free[i] else 0.0
     return replace(belief, covariance=covariance)
 

@@ -257,6 +257,12 @@ class Follower:
         inputs = self.belief.inputs
         return inputs is not None and inputs.range_slot >= 0
 
+    @property
+    def _biased(self) -> bool:
+        """Whether the track follows biases of our own ranges, which a fix takes for noise."""
+        inputs = self.belief.inputs
+        return inputs is not None and inputs.bias_slot >= 0
+
     def _gather(self, epoch: RangeEpoch) -> None:
         if len(epoch):
             self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
@@ -279,7 +285,7 @@ class Follower:
                 place(aged, who, start, self._arms[who], self.motion.tilt_pace_radps), self.belief.time_s, self.motion
             )
             self._refused[who], self._heard[who] = 0, True
-            if self._corrected:
+            if self._corrected or self._biased:
                 self.belief = loosen(self.belief, who)
                 self._begun_s[who] = self.belief.time_s
             else:

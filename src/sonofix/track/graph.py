@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import POSE, link
-from sonofix.locate.noise import row_noise
 from sonofix.records import Estimate, Floats
 from sonofix.track import steps, wheels
 from sonofix.track.belief import SIZE, Belief, predict
@@ -23,7 +22,7 @@ from sonofix.track.follow import SLIPPED_M, Follower
 from sonofix.track.inputs import COMPASS, STEP
 from sonofix.track.passage import YAW, Heard, Mark, Passage
 from sonofix.track.smooth import PASSES, settle, track
-from sonofix.track.update import expect, pairs_of
+from sonofix.track.update import expect, noise_of, pairs_of
 
 FLOOR = 1e-3
 """What any state may stray by from knot to knot, of its own deviation: a graph knows no constants."""
@@ -224,9 +223,9 @@ class Problem:
         measured = epoch.range_m[rows]
         if epoch.range_rate_mps is not None:
             measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
-        noise, links, pair = row_noise(epoch, links, rows, dt), links.rows(rows), np.zeros(0, np.int64)
+        pair = pairs_of(node.belief, epoch, rows)
+        noise, links = noise_of(node.belief, epoch, links, rows, dt, pair), links.rows(rows)
         if node.belief.trust is not None and epoch.snr_db is None:
-            pair = pairs_of(node.belief, epoch, rows)
             noise[np.diag_indices(len(rows))] += node.belief.trust.extra(pair)
 
         def miss(_factor: Any, values: Any, jacobians: Any) -> Floats:

@@ -51,11 +51,15 @@ class Inputs:
     arm : float64 (V, 2)
         `geometry.open_arms`.
     range_slot : int
-        Where the errors of ranges that others state stand (`track.stated`); −1: ranges are our own, and right.
+        Where the errors of ranges that others state stand (`track.stated`); −1: ranges are our own.
+    bias_slot : int
+        Where open biases of our own ranges stand (`track.paired`); −1: there are none.
     size : int
         How many states are added in all.
     pairs : mapping from (emitter, receiver) to int
-        Number of each pair whose ranges others state.
+        Number of each pair whose ranges others state, or whose bias in our own is open.
+    known_sd_m : float64 (P,)
+        How well the site file states each of these pairs' bias; NaN where it does not.
     """
 
     time_s: Floats
@@ -68,8 +72,10 @@ class Inputs:
     headed: NDArray[np.bool_]
     arm: Floats
     range_slot: int
+    bias_slot: int
     size: int
     pairs: Mapping[tuple[str, str], int]
+    known_sd_m: Floats
 
     def within(self, after_s: float, until_s: float) -> range:
         """Rows told after one instant and until another; none where the second is before the first."""
@@ -91,8 +97,13 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
     """Bring the tables that the track uses (`steps`, `odometry`, `compass`, `imu`) into one order.
 
     A row with an empty cell tells nothing but its time. ``stated``: the pairs (emitter, receiver) whose ranges come
-    from others, with errors of their own; None where ranges are our own. None where there is neither.
+    from others, with errors of their own; None where ranges are our own. Return None where there is neither, nor a pair
+    of the site whose bias is open.
     """
+    known = {(p.emitter, p.receiver): p.bias_sd_m for p in site.pairs}
+    asked = dict.fromkeys(stated if stated is not None else (pair for pair, sd_m in known.items() if sd_m))
+    pairs = {pair: i for i, pair in enumerate(asked)}
+    known_sd_m = np.array([known.get(pair, np.nan) for pair in pairs], float)
     ids, tilts = [v.id for v in site.vehicles], tilting(site) > 0
     parts: list[tuple[Floats, NDArray[np.int64], NDArray[np.int64], Floats]] = []
     for kind, stem in ((STEP, "steps"), (WHEELS, "odometry"), (COMPASS, "compass"), (GYRO, "imu")):
@@ -109,7 +120,7 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
                 times_s, values = _values(kind, own)
                 parts.append((times_s, np.full(len(times_s), kind), np.full(len(times_s), i), values))
     if not parts:
-        if stated is None:
+        if stated is None and not pairs:
             return None
         none = np.zeros(0, np.int64)
         parts.append((np.zeros(0), none, none, np.zeros((0, 4))))
@@ -124,9 +135,13 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
         for i in np.unique(vehicle[kinds == kind]).tolist():
             slots[kind, i] = SIZE * len(ids) + size
             size += len(states)
-    pairs = {pair: i for i, pair in enumerate(dict.fromkeys(stated or ()))}
-    range_slot = SIZE * len(ids) + size if stated is not None else -1
-    size += others.size(len(pairs)) if stated is not None else 0
+    range_slot, bias_slot = -1, -1
+    if stated is not None:
+        range_slot = SIZE * len(ids) + size
+        size += others.size(len(pairs))
+    elif pairs:
+        bias_slot = SIZE * len(ids) + size
+        size += len(pairs)
     headed = np.array([bool(np.any((vehicle == i) & np.isin(kinds, (WHEELS, COMPASS)))) for i in range(len(ids))])
     return Inputs(
         time_s[order],
@@ -139,8 +154,10 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
         headed,
         open_arms(site),
         range_slot,
+        bias_slot,
         size,
         pairs,
+        known_sd_m,
     )
 
 

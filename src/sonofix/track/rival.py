@@ -102,7 +102,7 @@ def beside(belief: Belief, vehicle: int, found: Fix, arm: Floats) -> Rival | Non
         return None
     begun = loosen(place(bare(belief), vehicle, found, arm), vehicle)
     mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
-    stated.begin(mean, covariance, free, belief.inputs.range_slot, len(belief.inputs.pairs))
+    stated.begin(mean, covariance, free, belief.inputs.range_slot, belief.inputs.known_sd_m)
     begun = replace(begun, mean=mean, covariance=covariance, free=free, trust=belief.trust.anew())
     return Rival(begun, vehicle, belief.time_s)
 

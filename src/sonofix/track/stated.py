@@ -2,7 +2,9 @@
 
 A range is stated as (1 + k) r + b + s + q + noise: k and b are common to all, s (slow) and q (quick) are first-order
 Gauss-Markov processes of each pair of an emitter and a receiver. How large s, q and the noise are is learnt from the
-ranges themselves, pair by pair with all pairs as the prior (docs/track.md).
+ranges themselves, pair by pair with all pairs as the prior (docs/track.md). Of a pair whose bias the site file states,
+that is taken off before, and s begins as well known as the file says. Scale and bias of all stay open even so: what
+a survey took for the way's scale, all its biases share.
 """
 
 from __future__ import annotations
@@ -127,12 +129,17 @@ def size(pairs: int) -> int:
     return COMMON + KINDS * pairs
 
 
-def begin(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, pairs: int) -> None:
-    """Open all errors, in place, before anything is known of them."""
+def begin(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, known_sd_m: Floats) -> None:
+    """Open all errors, in place, before any range has told of them.
+
+    ``known_sd_m`` (P,): how well the site file states what each pair's ranges err by; NaN where it does not.
+    """
+    pairs = len(known_sd_m)
     own = slice(slot, slot + size(pairs))
     mean[own] = covariance[own, :] = covariance[:, own] = 0.0
-    variances = np.concatenate([[SCALE_SD**2, BIAS_SD_M**2], np.full(KINDS * pairs, BEGIN_SD_M**2)])
-    covariance[own, own] = np.diag(variances)
+    slow = np.where(np.isnan(known_sd_m), BEGIN_SD_M, known_sd_m)
+    deviations = np.concatenate([[SCALE_SD, BIAS_SD_M], slow, np.full(pairs, BEGIN_SD_M)])
+    covariance[own, own] = np.diag(deviations**2)
     free[own] = True
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import Links, rows_at
 from sonofix.locate.noise import row_noise
 from sonofix.records import Floats, RangeEpoch
-from sonofix.track import stated
+from sonofix.track import paired, stated
 from sonofix.track.belief import Belief
 
 GATE_SIGMA = 5.0
@@ -21,6 +21,9 @@ GATE_SIGMA = 5.0
 
 SETTLED = 1e-6
 """Iterations end when nothing in the state moves by more, in its own unit."""
+
+WHOLE_STEPS = 8
+"""Iterations after which steps are halved."""
 
 ASTRAY = 1e-3
 """Ranges are not believed where the state still moves by more when iterations have run out."""
@@ -52,10 +55,10 @@ def update(
             belief = replace(belief, trust=replace(belief.trust, told=0.0))
         return belief, used, np.zeros(0)
     dt = epoch.time_s[rows] - belief.time_s
-    noise = row_noise(epoch, links, rows, dt)
+    pair = pairs_of(belief, epoch, rows)
+    noise = noise_of(belief, epoch, links, rows, dt, pair)
     measured = epoch.range_m[rows]
     trust, claimed = belief.trust if epoch.snr_db is None else None, noise.diagonal().copy()
-    pair = pairs_of(belief, epoch, rows) if trust is not None else np.zeros(0, np.int64)
     if trust is not None:
         noise[np.diag_indices(len(rows))] += trust.extra(pair)
     if epoch.range_rate_mps is not None:
@@ -85,7 +88,7 @@ def update(
     if not near.all():
         both = np.tile(near, 2) if with_rates else near
         links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
-        pair = pair if trust is None else pair[near]
+        pair = pair[near] if len(pair) else pair
         miss, derivative, crossed = miss[both], derivative[both], crossed[both]
     gain, last = np.zeros((0, 0)), np.inf
     for k in range(iterations if belief.about is None else 1):
@@ -94,7 +97,9 @@ def update(
             miss, crossed = measured - shown - derivative @ (belief.mean - mean), derivative @ belief.covariance
         gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
         moved = belief.mean + gain @ miss
-        last, mean = float(np.abs(moved - mean).max()), moved
+        last = float(np.abs(moved - mean).max())
+        # steps that go to and fro (a height at the beacons' own, where ranges bend most) meet half-way
+        mean = moved if k < WHOLE_STEPS or last < SETTLED else (mean + moved) / 2
         if last < SETTLED:
             break
     if last > ASTRAY and iterations > 1 and belief.about is None:
@@ -107,9 +112,27 @@ def update(
 
 
 def pairs_of(belief: Belief, epoch: RangeEpoch, rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Number of each row's pair."""
-    known = {} if belief.inputs is None else belief.inputs.pairs
-    return np.array([known[epoch.emitter[i], epoch.receiver[i]] for i in rows], np.int64)
+    """Number (n,) of each row's pair, −1 where none of its errors is followed; (0,) where no row's are."""
+    inputs = belief.inputs
+    if inputs is None or (inputs.range_slot < 0 if epoch.snr_db is None else inputs.bias_slot < 0):
+        return np.zeros(0, np.int64)
+    return np.array([inputs.pairs.get((epoch.emitter[i], epoch.receiver[i]), -1) for i in rows], np.int64)
+
+
+def noise_of(
+    belief: Belief,
+    epoch: RangeEpoch,
+    links: Links,
+    rows: NDArray[np.int64],
+    dt: Floats,
+    pair: NDArray[np.int64],
+) -> Floats:
+    """Covariance of rows as `row_noise` gives it, less what stays with a pair and is followed as a state."""
+    noise = row_noise(epoch, links, rows, dt)
+    if len(pair):
+        at = np.arange(len(rows))
+        noise[at, at] -= np.where(pair >= 0, epoch.bias_m2[rows], 0.0)
+    return noise
 
 
 def _learn(
@@ -139,6 +162,8 @@ def expect(
     shown, derivative = rows_at(links, mean, dt, epoch.sound_speed_mps, clock, rates, not belief.upright)
     if belief.inputs is None or not len(pair):
         return shown, derivative
+    if belief.inputs.bias_slot >= 0:
+        return paired.show(mean, belief.inputs.bias_slot, pair, shown, derivative)
     return stated.show(mean, belief.inputs.range_slot, pair, len(belief.inputs.pairs), shown, derivative)
 
 
@@ -148,12 +173,12 @@ def strangeness(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[
     rows = np.flatnonzero(asked & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
     dt = epoch.time_s[rows] - belief.time_s
     others = belief.trust is not None and epoch.snr_db is None
-    pair = pairs_of(belief, epoch, rows) if others else np.zeros(0, np.int64)
+    pair = pairs_of(belief, epoch, rows)
     shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
     measured = epoch.range_m[rows]
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
-    expected = derivative @ belief.covariance @ derivative.T + row_noise(epoch, links, rows, dt)
+    expected = derivative @ belief.covariance @ derivative.T + noise_of(belief, epoch, links, rows, dt, pair)
     if others and belief.trust is not None:
         expected[np.diag_indices(len(rows))] += belief.trust.extra(pair)
     miss = measured - shown
