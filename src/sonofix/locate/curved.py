@@ -21,7 +21,7 @@ import numpy as np
 from sonofix.geometry import ALONE
 from sonofix.locate.dense import factor, whitener
 from sonofix.locate.search import MOST, STEPS, keep, room, search, size
-from sonofix.locate.solve import beforehand, descend, misfit
+from sonofix.locate.solve import alike, beforehand, descend, misfit
 
 FIRST_SIGMA, GROWTH, GROWN = 4.0, 1.3, 40
 """Biases tried: first so many deviations of the row, each so much larger than the one before, so many at most."""
@@ -118,32 +118,51 @@ def bends_at(rows, c, clock, whiten, index, state, limit):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def hides(rows, c, clock, whiten, index, row, bias_m, state, limit, rate):
-    """Whether a bias slips through more often than ``rate``; ``state`` moves to where it leads, in place."""
+def hides(problem, test, row, bias_m, state):
+    """Whether a bias slips through more often than it may; ``state`` moves to where it leads, in place.
+
+    Parameters
+    ----------
+    problem : tuple
+        Exact rows and what else `search.search` takes, up to the level, and what whitens the rows.
+    test : tuple
+        The χ² test's limit, and how often a bias that counts as noticed may slip through.
+    """
+    rows, c, clock, covariance, index, flat, level_m, whiten = problem
+    limit, rate = test
     ends, dt, measured = rows
     m, count = len(measured), len(index)
-    biased = measured.copy()
+    biased, known = measured.copy(), np.empty((0, ALONE))
     biased[row] += bias_m
+    at = (ends, dt, biased)
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, count))
-    at, known = (ends, dt, biased), np.empty((0, ALONE))
     descend(at, c, clock, whiten, index, known, STEPS, state, plain, miss, jacobian)
     chi2, bends = bends_at(at, c, clock, whiten, index, state, limit)
-    return tail(limit, m - count, chi2, bends) > rate
+    slips = tail(limit, m - count, chi2, bends)
+    if slips > rate:
+        return True
+    # a bias may lead to several places, of which a walk sees one
+    states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, m, count))
+    for s in range(search(at, c, clock, covariance, index, flat, level_m, states, chi2s, jacobians)):
+        if not alike(states[s], state, 0.01, 0.02):
+            chi2, bends = bends_at(at, c, clock, whiten, index, states[s], limit)
+            slips += tail(limit, m - count, chi2, bends)
+    return slips > rate
 
 
 @numba.njit(cache=True, error_model="numpy")
-def edge(rows, c, clock, whiten, index, row, begin_at, bias_m, side, sd_m, limit, rate):
+def edge(problem, test, row, begin_at, bias_m, side, sd_m):
     """Walk from a bias at which a state fits outwards, ``side`` of it, until it is noticed; inf where it never is.
 
     Where the first one does not hide, 0 comes back: there is no valley.
     """
     state, tried = begin_at.copy(), begin_at.copy()
-    if not hides(rows, c, clock, whiten, index, row, bias_m, state, limit, rate):
+    if not hides(problem, test, row, bias_m, state):
         return 0.0
     hidden, seen, step = bias_m, np.inf, side * FIRST_SIGMA * sd_m
     for _ in range(GROWN):
         tried[:] = state
-        if not hides(rows, c, clock, whiten, index, row, bias_m + step, tried, limit, rate):
+        if not hides(problem, test, row, bias_m + step, tried):
             seen = bias_m + step
             break
         hidden, step = bias_m + step, step * GROWTH
@@ -153,7 +172,7 @@ def edge(rows, c, clock, whiten, index, row, begin_at, bias_m, side, sd_m, limit
     for _ in range(HALVINGS):
         middle = (hidden + seen) / 2
         tried[:] = state
-        if hides(rows, c, clock, whiten, index, row, middle, tried, limit, rate):
+        if hides(problem, test, row, middle, tried):
             hidden = middle
             state[:] = tried
         else:
@@ -190,14 +209,15 @@ def least_biases(rows, c, clock, covariance, index, flat, level_m, state, limit,
     misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian)
     for i in range(m):
         exact[i] = measured[i] - plain[i]
-    at = (ends, dt, exact)
+    at, test = (ends, dt, exact), (limit, rate)
+    problem = (at, c, clock, covariance, index, flat, level_m, whiten)
     part, fewer, choice = np.empty((part_m, part_m)), room(n - 1, part_m), np.empty(n - 1, np.int64)
     states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, part_m, count))
     before, known, valleys = beforehand(index), np.empty((0, ALONE)), np.empty((MOST, 2))
     for row in range(n):
         sd_m, least = np.sqrt(covariance[row, row]), 0.0
         for side in (-1.0, 1.0):
-            out_m = edge(at, c, clock, whiten, index, row, state, 0.0, side, sd_m, limit, rate)
+            out_m = edge(problem, test, row, state, 0.0, side, sd_m)
             least = max(least, abs(out_m))
         # the other rows' other solutions: with its range free, but not its rate, each is a valley of λ
         for i in range(n - 1):
@@ -213,7 +233,7 @@ def least_biases(rows, c, clock, covariance, index, flat, level_m, state, limit,
             side = 1.0 if bias_m > 0.0 else -1.0
             for k in range(2):
                 way = side if k else -side
-                valleys[s, k] = edge(at, c, clock, whiten, index, row, states[s], bias_m, way, sd_m, limit, rate) * side
+                valleys[s, k] = edge(problem, test, row, states[s], bias_m, way, sd_m) * side
         surely = least
         for _ in range(others):
             for s in range(others):

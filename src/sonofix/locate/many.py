@@ -1,7 +1,7 @@
 """Fixes by the thousand: one call for many epochs of ranges to fixed places, most of them without Python in between.
 
-Epochs that all agree with one place are solved in one compiled loop; the few whose ranges disagree, or fit two heights
-that nothing tells apart, go the way of `fix`. Both judge alike.
+All is one compiled loop, wrong ranges included; only epochs that fit two heights which nothing tells apart go the way of
+`fix`. Both judge alike.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonofix.geometry import Links
+from sonofix.locate.exclude import MENDED
 from sonofix.locate.fix import AMBIGUOUS_CHI2, Bounds, judged
-from sonofix.locate.integrity import threshold
-from sonofix.locate.standing import ONE_BY_ONE, solve_all
+from sonofix.locate.integrity import FALSE_ALARM, threshold
+from sonofix.locate.standing import ONE_BY_ONE
+from sonofix.locate.standing_all import solve_all
 from sonofix.records import FixStatus, Floats, RangeEpoch
 
 STATUSES: tuple[FixStatus, ...] = ("ok", "too-few", "no-convergence", "inconsistent", "ambiguous")
@@ -119,7 +121,8 @@ def fix_many(
     flat, n = level_m is not None, len(ranges)
     places = [0, 1] + [2] * (not flat)
     index = np.array(places + [3] * clock)
-    limits = np.array([threshold(count - len(index)) for count in range(len(anchors) + 1)])
+    degrees = np.arange(len(anchors) + 1) - len(index)
+    limits = np.array([[threshold(int(d), rate) for d in degrees] for rate in (FALSE_ALARM, MENDED)])
     status, state, chi2 = np.zeros(n, np.int8), np.full((n, 4), np.nan), np.full(n, np.nan)
     spreads, used = np.full((n, len(index), len(index)), np.nan), np.zeros((n, len(anchors)), bool)
     known = (flat, float(level_m or 0.0), clock, index)
