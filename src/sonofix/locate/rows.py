@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import ALONE, CLOCK, PITCH, PITCH_RATE, ROLL, ROLL_RATE, SAME_ARM_M, SIZE, YAW, Links, expected
+from sonofix.locate.curved import least_biases
 from sonofix.locate.dense import spread, whitener
 from sonofix.locate.integrity import RISK, levels, threshold
 from sonofix.locate.noise import CLOCK_SPEED_SD, row_noise
@@ -298,6 +299,13 @@ class Rows:
         variance = self._speed_sd_mps**2
         told = max(1.0 - variance * float(left @ left), 0.0)
         return self._speed_mps + variance * float(shown @ miss), self._speed_sd_mps * float(np.sqrt(told))
+
+    def least_biases(self, kept: NDArray[np.int64], found: Solution, missed_rate: float) -> Floats:
+        """Biases (p, 2) of the rows kept, as `curved.least_biases` has them at a solution."""
+        (rows, covariance), out = self._kept(kept), np.empty((len(kept), 2))
+        at = (self._speed_mps, self.clock, covariance, self._index, self.level_m is not None, float(self.level_m or 0))
+        least_biases(rows, *at, found.state, threshold(self.degrees(len(kept))), missed_rate, out)
+        return out
 
     def protection(
         self, kept: NDArray[np.int64], found: Solution, others: list[Solution], bounds_m: tuple | None

@@ -11,19 +11,32 @@ from sonofix.locate.standing import descend, misfit, solutions
 
 
 @numba.njit(cache=True, error_model="numpy")
-def chosen(problem, choice):
-    """Return places (p, 3), ranges (p,) and whitening matrix (p, p) of some rows, and room to descend in."""
-    anchors, measured, covariance, known = problem
-    p, count = len(choice), len(known[3])
-    places, some, part, whiten = np.empty((p, 3)), np.empty(p), np.empty((p, p)), np.empty((p, p))
-    for i in range(p):
+def room(p, count):
+    """Return empty places (p, 3), ranges (p,) and whitening matrix (p, p) of p rows, and room to descend in."""
+    work = (np.empty(p), np.empty(p), np.empty((p, count)), np.empty((p, count)))
+    return np.empty((p, 3)), np.empty(p), np.empty((p, p)), work
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fill(problem, choice, rows, part):
+    """Put some rows where `room` made room for them; ``part`` (p, p) is spoilt."""
+    anchors, measured, covariance, _ = problem
+    places, some, whiten, _ = rows
+    for i in range(len(choice)):
         some[i] = measured[choice[i]]
         for axis in range(3):
             places[i, axis] = anchors[choice[i], axis]
-        for k in range(p):
+        for k in range(len(choice)):
             part[i, k] = covariance[choice[i], choice[k]]
     whitener(part, whiten)
-    return places, some, whiten, (np.empty(p), np.empty(p), np.empty((p, count)), np.empty((p, count)))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def chosen(problem, choice):
+    """Return some rows as `room` has them."""
+    rows = room(len(choice), len(problem[3][3]))
+    fill(problem, choice, rows, np.empty((len(choice), len(choice))))
+    return rows
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -53,10 +66,13 @@ def leaving(rows, count):
 @numba.njit(cache=True, error_model="numpy")
 def without(problem, choices, begin_at, states, chi2s):
     """Descend from one state with each choice of rows alone: (q, 4) and (q,), out."""
-    nothing = np.empty((0, 4))
+    p, nothing = choices.shape[1], np.empty((0, 4))
+    rows, part = room(p, len(problem[3][3])), np.empty((p, p))
+    places, some, whiten, work = rows
     for q in range(len(choices)):
-        places, some, whiten, work = chosen(problem, choices[q])
-        states[q] = begin_at
+        fill(problem, choices[q], rows, part)
+        for j in range(4):
+            states[q, j] = begin_at[j]
         chi2s[q], _ = descend(places, some, whiten, problem[3][3], nothing, states[q], work)
 
 
@@ -122,12 +138,14 @@ def leave_out(problem, limits, states, chi2s, found):
         again = anew(problem, choices[best], states, chi2s)
         if not again:
             continue
-        near_m, isolated = APART_SIGMA * place_sd_m(problem, choices[best], states[0]), True
+        farthest = 0.0
         for i in range(len(choices)):
-            gap = 0.0
-            for axis in range(3):
-                gap += (places[i, axis] - places[best, axis]) ** 2
-            isolated &= not (misfits[i] <= limits[0, left] and np.sqrt(gap) > near_m)
+            if misfits[i] <= limits[0, left]:
+                gap = 0.0
+                for axis in range(3):
+                    gap += (places[i, axis] - places[best, axis]) ** 2
+                farthest = max(farthest, np.sqrt(gap))
+        isolated = not farthest or farthest <= APART_SIGMA * place_sd_m(problem, choices[best], states[0])
         return choices[best].copy(), again, isolated
     kept, found = one_by_one(problem, limits, begin_at, whole, states, chi2s)
     return kept, found, True
