@@ -89,7 +89,8 @@ def descend(anchors, measured, whiten, index, known, state, work):
         for j in range(count):
             step[j] /= size[j]
             for k in range(j + 1):
-                normal[j, k] /= size[j] * size[k]
+                # one after the other: where a direction is open, the square of its size is 0
+                normal[j, k] = normal[j, k] / size[j] / size[k]
             normal[j, j] += damping
         downhill, new_chi2 = factor(normal), np.inf
         if downhill:
