@@ -11,9 +11,7 @@ from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.site import Site
 
 
-def detectable_biases(
-    epoch: RangeEpoch, site: Site, found: Fix, missed_rate: float = MISSED
-) -> tuple[Floats, Floats]:
+def detectable_biases(epoch: RangeEpoch, site: Site, found: Fix, missed_rate: float = MISSED) -> tuple[Floats, Floats]:
     """Return the least bias of each range alone, of either sign, that the χ² test of a fix notices at its place.
 
     With a range or two to spare a bias moves the fix far before it shows, ranges bend on the way, and the others may

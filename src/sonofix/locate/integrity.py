@@ -191,8 +191,8 @@ def protection_levels(
     Returns
     -------
     hpl_m, vpl_m : float, float or None
-        inf where a fault may go unnoticed at any size (too few rows, or no more of them than faults), or where there are
-        more than `MOST_SETS` ways to choose ``faults`` groups; vpl_m None where ``vertical`` is.
+        inf where a fault may go unnoticed at any size (too few rows, or fewer than faults), or where there are more
+        than `MOST_SETS` ways to choose ``faults`` groups; vpl_m None where ``vertical`` is.
 
     Raises
     ------

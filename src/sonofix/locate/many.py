@@ -1,7 +1,7 @@
-"""Fixes by the thousand: one call for many epochs of ranges to fixed places, most of them without Python in between.
+"""Fixes by the thousand: one call for many epochs of ranges to fixed places, without Python in between.
 
-All is one compiled loop, wrong ranges included; only epochs that fit two heights which nothing tells apart go the way of
-`fix`. Both judge alike.
+All is one compiled loop, wrong ranges included; only epochs that fit two heights which nothing tells apart go the way
+of `fix`. Both judge alike.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ def fix_many(
     Raises
     ------
     ValueError
-        If shapes do not match; a place, a level or a range is not finite; a range is below 0 by more than noise makes it
-        where the clock is known; or the covariance of ranges that were heard is not positive, finite and symmetric.
+        If shapes do not match; a place, a level or a range is not finite; a range is below 0 by more than noise makes
+        it where the clock is known; or the covariance of ranges heard is not positive, finite and symmetric.
     """
     anchors = np.ascontiguousarray(anchors_m, float)
     ranges = np.ascontiguousarray(ranges_m, float)
