@@ -211,7 +211,7 @@ class Noticed:
 def count_in_layouts(
     unknowns: str, spare: int, layouts: int, draws: int, rng: np.random.Generator, linear: bool = False
 ) -> Noticed:
-    """Count in random layouts of beacons, so many ranges to spare, what a fix at a random place says that it notices."""
+    """Count what a fix at a random place in random layouts, with so many ranges to spare, says that it notices."""
     (flat, clock), out = UNKNOWNS[unknowns], Noticed()
     clock_m = 20.0 if clock else 0.0
     count, done = 2 + (not flat) + clock + spare, 0
@@ -353,9 +353,7 @@ def test_detection_in_many_layouts(rng: np.random.Generator) -> None:
         "at up to half as large again as what is sure to be, and, beside it, at what the linear model (Baarda) gives;"
     )
     print("how much larger the least one is than that of the linear model; and alarms without fault, of 10 000.\n")
-    print(
-        "| unknown | to spare | biases | least | beyond what is sure | linear | least / linear: 50 %, 95 %, most | alarms |"
-    )
+    print("| unknown | to spare | biases | least | beyond sure | linear | least / linear: 50 %, 95 %, most | alarms |")
     print("|---|---|---|---|---|---|---|---|")
     for unknowns in UNKNOWNS:
         for spare in (1, 2, 3, 5):

@@ -251,7 +251,7 @@ def levels(
 
     def level(states: NDArray[np.int64]) -> float:
         sd = largest(deviation, states)
-        alone = sd * float(_deviations(quiet_risk, len(states)))
+        alone = sd * _quiet(quiet_risk, len(states))
         if not fault_probability:
             return alone
         slope = steepest(gain, seen, size, sets, states) if len(white) > count else np.inf
@@ -277,6 +277,11 @@ def _deviations(probability: float | Floats, count: int) -> Floats:
 
     likely = np.minimum(probability, 1.0)
     return np.asarray(-ndtri(likely / 2) if count == 1 else np.sqrt(-2 * np.log(likely)))
+
+
+@lru_cache(maxsize=256)
+def _quiet(probability: float, count: int) -> float:
+    return float(_deviations(probability, count))
 
 
 @lru_cache(maxsize=256)

@@ -256,14 +256,12 @@ class Rows:
         return out if spread(found.jacobian, out) else None
 
     def bent(self, kept: NDArray[np.int64], found: Solution, covariance: Floats) -> Floats:
-        """What the bend of rows over the reach of roll and pitch adds to a covariance (k, k): a second-order term.
+        """What the bend of rows over the reach of roll and pitch adds to a covariance (k, k) of a body that tilts.
 
         A tilt that rows tell poorly swings ends on arcs, which the linear model takes for straight. All unknowns move
         with it as their covariance has it; what rows then show beyond the linear model, h = ½ H ξ² with ξ of unit
         variance and E(h²) = ¾ H², is noise of the rows (Bar-Shalom 2001, section 10.3.2).
         """
-        if not self.tilts:
-            return np.zeros_like(covariance)
         (rows, noise), unknowns = self._kept(kept), self._index
         tilt = np.isin(unknowns, (ROLL, PITCH))
         size, axes = np.linalg.eigh(covariance[np.ix_(tilt, tilt)])
