@@ -113,8 +113,8 @@ def many(count: int, turns: int) -> None:
         rows,
     )
     print(
-        "\nWrong ranges are 0.1 to 2 m too long. Finding them is part of a fix's time; least_squares takes all ranges for"
-        " good, once. Answers are compared where both take the same ranges: those that the fix has left."
+        "\nWrong ranges are 0.1 to 2 m too long. Finding them is part of a fix's time; least_squares takes all ranges "
+        "for good, once. Answers are compared where both take the same ranges: those that the fix has left."
     )
 
 
