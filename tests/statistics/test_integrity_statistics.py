@@ -342,7 +342,7 @@ def test_detection_over_many_epochs(rng: np.random.Generator) -> None:
 
 @pytest.mark.prove
 def test_detection_in_many_layouts(rng: np.random.Generator) -> None:
-    layouts, draws = 400, 250
+    layouts, draws = 200, 500
     print(
         f"\nBiases that a fix says it notices, in {layouts} random layouts of beacons a row (10 m × 8 m × 3 m, a random"
     )

@@ -22,6 +22,9 @@ from sonofix.records import Floats, RangeEpoch
 UNKNOWN_SPEED_MPS = 1.0
 """Deviation of the velocity (from 0) where no range rates tell of it: a walk."""
 
+ASTRAY_SIGMA = 3.0
+"""Deviations that a place may be off by at which the least bias noticed is told."""
+
 ROCKING_RADPS = 2.0
 """How fast a body that tilts rocks, one sigma."""
 
@@ -299,11 +302,21 @@ class Rows:
         return self._speed_mps + variance * float(shown @ miss), self._speed_sd_mps * float(np.sqrt(told))
 
     def least_biases(self, kept: NDArray[np.int64], found: Solution, missed_rate: float) -> Floats:
-        """Biases (p, 2) of the rows kept, as `curved.least_biases` has them at a solution."""
-        (rows, covariance), out = self._kept(kept), np.empty((len(kept), 2))
+        """Biases (p, 2) of the rows kept, as `curved.least_biases` has them: the largest of where a solution may lie.
+
+        That is there, and `ASTRAY_SIGMA` of its deviations to either side along the position's widest axis.
+        """
+        (rows, covariance), out = self._kept(kept), np.empty((3, len(kept), 2))
         at = (self._speed_mps, self.clock, covariance, self._index, self.level_m is not None, float(self.level_m or 0))
-        least_biases(rows, *at, found.state, threshold(self.degrees(len(kept))), missed_rate, out)
-        return out
+        spreads, shift = self.covariance(found), np.zeros(ALONE)
+        if spreads is not None:
+            places = 2 if self.level_m is not None else 3
+            size, axes = np.linalg.eigh(spreads[:places, :places])
+            shift[self._index] = ASTRAY_SIGMA * spreads[:, :places] @ axes[:, -1] / np.sqrt(size[-1])
+        for side in range(3):
+            state = found.state + (side - 1) * shift
+            least_biases(rows, *at, state, threshold(self.degrees(len(kept))), missed_rate, out[side])
+        return out.max(axis=0)
 
     def protection(
         self, kept: NDArray[np.int64], found: Solution, others: list[Solution], bounds_m: tuple | None
