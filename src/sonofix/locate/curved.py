@@ -181,17 +181,18 @@ def edge(problem, test, row, begin_at, bias_m, side, sd_m):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def least_biases(rows, c, clock, covariance, index, flat, level_m, state, limit, rate, out):
+def least_biases(rows, c, clock, covariance, index, flat, level_m, places, limit, rate, out):
     """Fill ``out`` (n, 2): of each range the least bias that is noticed, and that beyond which none hides.
 
-    Of either sign; infinite where none is.
+    Of either sign, wherever of some places the true one is; infinite where there is none. Where a second place fits
+    that lies so near that its valley joins that of the first, both are the same.
 
     Parameters
     ----------
     rows, c, clock, covariance, index, flat, level_m
         As `search.search` takes them.
-    state : float64 (ALONE,)
-        The place, from which exact rows are taken.
+    places : float64 (p, ALONE)
+        States, from which exact rows are taken.
     limit : float
         Of the χ² test.
     rate : float
@@ -206,38 +207,37 @@ def least_biases(rows, c, clock, covariance, index, flat, level_m, state, limit,
     exact, whiten, loose = np.empty(m), np.empty((m, m)), np.empty((m, m))
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, count))
     whitener(covariance, whiten)
-    misfit(rows, c, clock, whiten, index, state, plain, miss, jacobian)
-    for i in range(m):
-        exact[i] = measured[i] - plain[i]
     at, test = (ends, dt, exact), (limit, rate)
     problem = (at, c, clock, covariance, index, flat, level_m, whiten)
     part, fewer, choice = np.empty((part_m, part_m)), room(n - 1, part_m), np.empty(n - 1, np.int64)
     states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, part_m, count))
-    before, known, valleys = beforehand(index), np.empty((0, ALONE)), np.empty((MOST, 2))
-    for row in range(n):
-        sd_m, least = np.sqrt(covariance[row, row]), 0.0
-        for side in (-1.0, 1.0):
-            out_m = edge(problem, test, row, state, 0.0, side, sd_m)
-            least = max(least, abs(out_m))
-        # the other rows' other solutions: with its range free, but not its rate, each is a valley of λ
-        for i in range(n - 1):
-            choice[i] = i + (i >= row)
-        keep(at, covariance, choice, before, fewer, part)
-        others = search(fewer, c, clock, part, index, flat, level_m, states, chi2s, jacobians)
-        part_of = covariance.copy()
-        part_of[row, row] += (FREE * sd_m) ** 2
-        whitener(part_of, loose)
-        for s in range(others):
-            descend(at, c, clock, loose, index, known, STEPS, states[s], plain, miss, jacobian)
-            bias_m = -plain[row]
-            side = 1.0 if bias_m > 0.0 else -1.0
-            for k in range(2):
-                way = side if k else -side
-                valleys[s, k] = edge(problem, test, row, states[s], bias_m, way, sd_m) * side
-        surely = least
-        for _ in range(others):
+    before, known = beforehand(index), np.empty((0, ALONE))
+    own, nearest, farthest = np.zeros(n), np.full(n, np.inf), np.zeros(n)
+    for place in places:
+        misfit(rows, c, clock, whiten, index, place, plain, miss, jacobian)
+        for i in range(m):
+            exact[i] = measured[i] - plain[i]
+        for row in range(n):
+            sd_m = np.sqrt(covariance[row, row])
+            for side in (-1.0, 1.0):
+                own[row] = max(own[row], abs(edge(problem, test, row, place, 0.0, side, sd_m)))
+            # the other rows' other solutions: with its range free, but not its rate, each is a valley of λ
+            for i in range(n - 1):
+                choice[i] = i + (i >= row)
+            keep(at, covariance, choice, before, fewer, part)
+            others = search(fewer, c, clock, part, index, flat, level_m, states, chi2s, jacobians)
+            part_of = covariance.copy()
+            part_of[row, row] += (FREE * sd_m) ** 2
+            whitener(part_of, loose)
             for s in range(others):
-                surely = max(surely, valleys[s, 1])
-                if valleys[s, 0] <= least:
-                    least = max(least, valleys[s, 1])
-        out[row, 0], out[row, 1] = least, surely
+                descend(at, c, clock, loose, index, known, STEPS, states[s], plain, miss, jacobian)
+                bias_m = -plain[row]
+                side = 1.0 if bias_m > 0.0 else -1.0
+                outer = edge(problem, test, row, states[s], bias_m, side, sd_m) * side
+                if outer > own[row]:
+                    inner = edge(problem, test, row, states[s], bias_m, -side, sd_m) * side
+                    nearest[row] = min(nearest[row], inner)
+                    farthest[row] = max(farthest[row], outer)
+    for row in range(n):
+        out[row, 1] = max(own[row], farthest[row])
+        out[row, 0] = own[row] if nearest[row] > own[row] else out[row, 1]

@@ -302,21 +302,21 @@ class Rows:
         return self._speed_mps + variance * float(shown @ miss), self._speed_sd_mps * float(np.sqrt(told))
 
     def least_biases(self, kept: NDArray[np.int64], found: Solution, missed_rate: float) -> Floats:
-        """Biases (p, 2) of the rows kept, as `curved.least_biases` has them: the largest of where a solution may lie.
+        """Biases (p, 2) of the rows kept, as `curved.least_biases` has them, of places where a solution may lie.
 
-        That is there, and `ASTRAY_SIGMA` of its deviations to either side along the position's widest axis.
+        That is where it does, and `ASTRAY_SIGMA` of its deviations to either side along the position's widest axis.
         """
-        (rows, covariance), out = self._kept(kept), np.empty((3, len(kept), 2))
+        (rows, covariance), out = self._kept(kept), np.empty((len(kept), 2))
         at = (self._speed_mps, self.clock, covariance, self._index, self.level_m is not None, float(self.level_m or 0))
-        spreads, shift = self.covariance(found), np.zeros(ALONE)
+        spreads, places = self.covariance(found), np.tile(found.state, (3, 1))
         if spreads is not None:
-            places = 2 if self.level_m is not None else 3
-            size, axes = np.linalg.eigh(spreads[:places, :places])
-            shift[self._index] = ASTRAY_SIGMA * spreads[:, :places] @ axes[:, -1] / np.sqrt(size[-1])
-        for side in range(3):
-            state = found.state + (side - 1) * shift
-            least_biases(rows, *at, state, threshold(self.degrees(len(kept))), missed_rate, out[side])
-        return out.max(axis=0)
+            axes = 2 if self.level_m is not None else 3
+            size, along = np.linalg.eigh(spreads[:axes, :axes])
+            shift = ASTRAY_SIGMA * spreads[:, :axes] @ along[:, -1] / np.sqrt(size[-1])
+            places[1, self._index] += shift
+            places[2, self._index] -= shift
+        least_biases(rows, *at, places, threshold(self.degrees(len(kept))), missed_rate, out)
+        return out
 
     def protection(
         self, kept: NDArray[np.int64], found: Solution, others: list[Solution], bounds_m: tuple | None
