@@ -68,15 +68,19 @@ def many(count: int, turns: int) -> None:
     """Print how many fixes a second one call for many epochs solves, beside least_squares epoch by epoch."""
     site, rng = demo_site(), np.random.default_rng(6)
     anchors, rows = _anchors(site), []
-    for name, missing, faulty in (
-        ("eight ranges each", 0.0, 0.0),
-        ("one range in ten not heard", 0.1, 0.0),
-        ("one epoch in a hundred with a wrong range", 0.0, 0.01),
+    for name, missing, faulty, wrong in (
+        ("eight ranges each", 0.0, 0.0, 0),
+        ("one range in ten not heard", 0.1, 0.0, 0),
+        ("one epoch in a hundred with a wrong range", 0.0, 0.01, 1),
+        ("every epoch with a wrong range", 0.0, 1.0, 1),
+        ("every epoch with two wrong ranges", 0.0, 1.0, 2),
     ):
         places = rng.uniform((1.0, 1.0, 0.0), (11.0, 8.0, 0.0), (count, 3))
         ranges_m = np.linalg.norm(places[:, None] - anchors, axis=2)
         ranges_m += RANGE_SD_M * rng.standard_normal(ranges_m.shape)
-        ranges_m[rng.random(count) < faulty, 0] += 0.5
+        who = np.flatnonzero(rng.random(count) < faulty)
+        hit = rng.permuted(np.tile(np.arange(len(anchors)), (len(who), 1)), axis=1)[:, :wrong]
+        ranges_m[who[:, None], hit] += rng.uniform(0.1, 2.0, hit.shape)
         ranges_m[rng.random(ranges_m.shape) < missing] = np.nan
         variance = np.full(len(anchors), RANGE_SD_M**2)
         some = ranges_m[: count // 100]
@@ -88,9 +92,9 @@ def many(count: int, turns: int) -> None:
             return np.array([_level_least_squares(anchors, r) for r in some])
 
         timed = beside(ours, peer, turns)
-        found, theirs = ours(), peer()
-        same = (found.status[: len(some)] == 0) & (found.used[: len(some)].sum(1) == np.isfinite(some).sum(1))
-        apart_m = np.abs(found.position_m[: len(some), :2] - theirs)[same].max()
+        found = ours()
+        theirs = peer(np.where(found.used[: len(some)], some, np.nan)[found.status[: len(some)] == 0])
+        apart_m = np.abs(found.position_m[: len(some), :2][found.status[: len(some)] == 0] - theirs).max()
         error_m = np.sqrt(np.nanmean(np.sum((found.position_m - places) ** 2, axis=1)))
         ours_hz, theirs_hz = count / timed.job_s, len(some) / timed.floor_s
         rows.append(
@@ -109,7 +113,8 @@ def many(count: int, turns: int) -> None:
         rows,
     )
     print(
-        "\nEpochs whose ranges disagree are judged one by one, as by `fix`; answers are compared where all rows count."
+        "\nWrong ranges are 0.1 to 2 m too long. Finding them is part of a fix's time; least_squares takes all ranges "
+        "for good, once. Answers are compared where both take the same ranges: those that the fix has left."
     )
 
 

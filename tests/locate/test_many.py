@@ -60,6 +60,34 @@ def test_each_is_what_fix_says(
     assert (found.clock_offset_m is None) == (clock_m is None)
 
 
+@pytest.mark.parametrize("faults", [1, 2, 3, 8])
+@pytest.mark.parametrize("level_m", [None, 1.1])
+@pytest.mark.parametrize("clock_m", [None, 5.0])
+@pytest.mark.parametrize("anchors", [ANCHORS, CEILING], ids=["walls", "ceiling"])
+def test_wrong_ranges_are_left_out_as_by_fix(
+    anchors: Floats, faults: int, level_m: float | None, clock_m: float | None, rng: np.random.Generator
+) -> None:
+    site = make_site(anchors, level_m=level_m, bounds_m=BOUNDS)
+    _, measured = ranges(anchors, 40, level_m, rng)
+    for row in measured:
+        wrong = rng.choice(len(anchors), min(faults, len(anchors)), replace=False)
+        row[wrong] += rng.choice((-1.0, 1.0), len(wrong)) * rng.uniform(0.05, 1.5, len(wrong))
+    measured = np.abs(measured) + (clock_m or 0.0)
+    found = fix_many(
+        anchors, measured, np.full(len(anchors), SD_M**2), level_m=level_m, clock=clock_m is not None, bounds_m=BOUNDS
+    )
+    epoch = make_epoch(site, Drive((0.0, 0.0, level_m or 0.0)), sd_m=SD_M, clock_m=clock_m)
+    told = 0
+    for e in range(len(found)):
+        one = fix(replace(epoch, range_m=measured[e]), site, "v")
+        assert (STATUSES[found.status[e]], found.used[e].tolist()) == (one.status, one.used.tolist())
+        if one.position_m is not None:
+            told += 1
+            np.testing.assert_allclose(found.position_m[e], one.position_m, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(found.covariance[e], one.covariance, rtol=1e-4, atol=1e-12)
+    assert told > 0
+
+
 def test_scipy_agrees_to_a_micrometre(rng: np.random.Generator) -> None:
     _, measured = ranges(ANCHORS, 60, 1.1, rng)
     found = fix_many(ANCHORS, measured, np.full(8, SD_M**2), level_m=1.1)
@@ -105,17 +133,65 @@ def test_no_epochs_are_no_trouble() -> None:
     assert found.position_m.shape == (0, 3)
 
 
+def changed(values: Floats, at: tuple, to: float) -> Floats:
+    out = values.copy()
+    out[at] = to
+    return out
+
+
 @pytest.mark.parametrize(
     ("anchors", "measured", "covariance", "word"),
     [
-        (ANCHORS[:, :2], np.ones((1, 8)), np.ones(8), "anchors_m"),
-        (ANCHORS, np.ones((1, 7)), np.ones(8), "ranges_m"),
-        (ANCHORS, np.ones((1, 8)), np.ones(7), "covariance_m2"),
-        (ANCHORS, np.ones((1, 8)), np.zeros(8), "epoch 0"),
+        (ANCHORS[:, :2], np.ones((1, 8)), np.ones(8), "anchors_m has shape"),
+        (changed(ANCHORS, (3, 1), np.nan), np.ones((1, 8)), np.ones(8), r"anchors_m\[3\]"),
+        (ANCHORS, np.ones((1, 7)), np.ones(8), "ranges_m has shape"),
+        (ANCHORS, np.ones(8), np.ones(8), "ranges_m has shape"),
+        (ANCHORS, changed(np.ones((3, 8)), (2, 5), np.inf), np.ones(8), r"ranges_m\[2, 5\] is inf"),
+        (ANCHORS, changed(np.ones((3, 8)), (1, 4), -1.0), np.full(8, 1e-4), r"ranges_m\[1, 4\] is -1"),
+        (ANCHORS, np.ones((1, 8)), np.ones(7), "covariance_m2 has shape"),
+        (ANCHORS, np.ones((1, 8)), np.zeros(8), "epoch 0, anchor 0 is 0"),
+        (ANCHORS, np.ones((3, 8)), changed(np.ones((3, 8)), (2, 1), -1.0), "epoch 2, anchor 1 is -1"),
+        (ANCHORS, np.ones((3, 8)), changed(np.ones((3, 8)), (1, 6), np.nan), "epoch 1, anchor 6 is nan"),
+        (ANCHORS, np.ones((3, 8)), changed(np.ones(8), (2,), np.inf), "epoch 0, anchor 2 is inf"),
+        (ANCHORS, np.ones((3, 8)), np.ones((8, 8)), "positive definite"),
+        (ANCHORS, np.ones((3, 8)), changed(np.eye(8), (0, 1), 0.2), "not symmetric"),
     ],
 )
 def test_misuse_is_named(anchors: Floats, measured: Floats, covariance: Floats, word: str) -> None:
     with pytest.raises(ValueError, match=word):
         fix_many(anchors, measured, covariance)
-    with pytest.raises(ValueError, match="bounds_m"):
-        fix_many(ANCHORS, np.ones((1, 8)), np.ones(8), bounds_m=[[1, 1, 1], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("asked", "word"),
+    [
+        ({"bounds_m": [[1, 1, 1], [0, 0, 0]]}, "bounds_m"),
+        ({"bounds_m": [[0, 0, np.nan], [1, 1, 1]]}, "bounds_m"),
+        ({"bounds_m": [0, 0, 0]}, "bounds_m"),
+        ({"level_m": np.nan}, "level_m nan"),
+    ],
+)
+def test_a_room_or_level_that_is_none_is_named(asked: dict, word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        fix_many(ANCHORS, np.ones((1, 8)), np.ones(8), **asked)
+
+
+def test_what_was_not_heard_needs_no_variance(rng: np.random.Generator) -> None:
+    _, measured = ranges(ANCHORS, 4, 1.1, rng)
+    measured[:, 2] = np.nan
+    variance = np.full((4, 8), SD_M**2)
+    unknown = variance.copy()
+    unknown[:, 2] = np.nan
+    found = [fix_many(ANCHORS, measured, given, level_m=1.1) for given in (variance, unknown)]
+    assert (found[1].status == 0).all()
+    np.testing.assert_array_equal(found[0].position_m, found[1].position_m)
+
+
+def test_noise_may_make_a_range_negative_at_an_anchor_and_a_clock_any(rng: np.random.Generator) -> None:
+    at = ANCHORS[0]
+    measured = np.linalg.norm(at - ANCHORS, axis=1)[None] - 2.0 * SD_M * np.eye(8)[:1]
+    found = fix_many(ANCHORS, measured, np.full(8, SD_M**2))
+    assert found.status[0] == 0
+    assert np.linalg.norm(found.position_m[0] - at) < 0.1
+    found = fix_many(ANCHORS, measured - 20.0, np.full(8, SD_M**2), clock=True)
+    assert found.clock_offset_m[0] == pytest.approx(-20.0, abs=0.1)

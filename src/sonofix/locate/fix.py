@@ -98,7 +98,8 @@ def judged(
     if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
         text = "the beacons in reach leave a direction open; spread them off one line or plane"
         return _failed(epoch, vehicle, time_s, "no-convergence", text)
-    covariance = covariance + solver.bent(kept, best, covariance)
+    if solver.tilts:
+        covariance = covariance + solver.bent(kept, best, covariance)
     hpl_m = vpl_m = None
     if status == "ok":
         hpl_m, vpl_m = solver.protection(kept, best, [s for s in found if s is not best], bounds_m)
@@ -208,6 +209,8 @@ def _too_weak(best: Solution, covariance: Floats, solver: Rows, rows: NDArray[np
 def _shift_to_origin(best: Solution, covariance: Floats, arm: Floats) -> tuple[Floats, Floats]:
     """Position of the vehicle's origin where a lever arm leaves the heading open: the arm becomes uncertainty."""
     position, covariance = best.position_m.copy(), covariance.copy()
+    if not arm[0] and not arm[1]:
+        return position, covariance
     shift, sd_m = from_arm(arm, best.state[4:7])
     position[:2] += shift
     covariance[:2, :2] += np.eye(2) * sd_m**2

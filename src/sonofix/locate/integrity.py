@@ -29,8 +29,8 @@ from sonofix.records import Floats
 FALSE_ALARM = 1e-5
 """Of the χ² test that a fix makes, per epoch: far below what is asked (1e-3), since real noise has wider tails."""
 
-MISSED = 1e-3
-"""Of a bias as large as the minimum detectable one."""
+MISSED = 5e-4
+"""Of a bias as large as the minimum detectable one: half of what is asked (1e-3)."""
 
 RISK = 1e-7
 """Of an error beyond the protection level without an alarm, per epoch."""
@@ -115,7 +115,9 @@ def slopes(jacobian: Floats, covariance: Floats, states: Sequence[int]) -> Float
 def minimum_detectable_bias(
     jacobian: Floats, covariance: Floats, false_alarm_rate: float = FALSE_ALARM, missed_rate: float = MISSED
 ) -> Floats:
-    """Smallest bias of each row alone that the χ² test notices (Baarda's internal reliability).
+    """Smallest bias of each row alone that the χ² test notices (Baarda's internal reliability), of a linear model.
+
+    What ranges that bend make of it, a fix can tell: `detectable.detectable_biases`.
 
     Parameters
     ----------
@@ -189,8 +191,8 @@ def protection_levels(
     Returns
     -------
     hpl_m, vpl_m : float, float or None
-        inf where a fault may go unnoticed at any size (too few rows), or where there are more than `MOST_SETS` ways to
-        choose ``faults`` groups; vpl_m None where ``vertical`` is.
+        inf where a fault may go unnoticed at any size (too few rows, or fewer than faults), or where there are more
+        than `MOST_SETS` ways to choose ``faults`` groups; vpl_m None where ``vertical`` is.
 
     Raises
     ------
@@ -237,7 +239,7 @@ def levels(
     if rank < count or not spread(white, deviation):
         return np.inf, None if vertical is None else np.inf
     sets = np.arange(len(white))[:, None] if groups is None else np.asarray(groups, np.int64)
-    if fault_probability and comb(len(sets), faults) > MOST_SETS:
+    if fault_probability and (faults > len(sets) or comb(len(sets), faults) > MOST_SETS):
         return np.inf, None if vertical is None else np.inf
     if fault_probability and faults > 1:
         chosen = np.array(list(combinations(range(len(sets)), faults)), np.int64).reshape(-1, faults)
@@ -249,7 +251,7 @@ def levels(
 
     def level(states: NDArray[np.int64]) -> float:
         sd = largest(deviation, states)
-        alone = sd * float(_deviations(quiet_risk, len(states)))
+        alone = sd * _quiet(quiet_risk, len(states))
         if not fault_probability:
             return alone
         slope = steepest(gain, seen, size, sets, states) if len(white) > count else np.inf
@@ -275,6 +277,11 @@ def _deviations(probability: float | Floats, count: int) -> Floats:
 
     likely = np.minimum(probability, 1.0)
     return np.asarray(-ndtri(likely / 2) if count == 1 else np.sqrt(-2 * np.log(likely)))
+
+
+@lru_cache(maxsize=256)
+def _quiet(probability: float, count: int) -> float:
+    return float(_deviations(probability, count))
 
 
 @lru_cache(maxsize=256)

@@ -1,7 +1,7 @@
-"""Fixes by the thousand: one call for many epochs of ranges to fixed places, most of them without Python in between.
+"""Fixes by the thousand: one call for many epochs of ranges to fixed places, without Python in between.
 
-Epochs that all agree with one place are solved in one compiled loop; the few whose ranges disagree, or fit two heights
-that nothing tells apart, go the way of `fix`. Both judge alike.
+All is one compiled loop, wrong ranges included; only epochs that fit two heights which nothing tells apart go the way
+of `fix`. Both judge alike.
 """
 
 from __future__ import annotations
@@ -13,10 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sonofix.geometry import Links
+from sonofix.locate.exclude import MENDED
 from sonofix.locate.fix import AMBIGUOUS_CHI2, Bounds, judged
-from sonofix.locate.integrity import threshold
-from sonofix.locate.standing import ONE_BY_ONE, solve_all
+from sonofix.locate.integrity import FALSE_ALARM, threshold
+from sonofix.locate.standing import ONE_BY_ONE
+from sonofix.locate.standing_all import solve_all
 from sonofix.records import FixStatus, Floats, RangeEpoch
+
+NEGATIVE_SIGMA = 6.0
+"""Deviations that noise may put a range below 0 by, right at an anchor."""
 
 STATUSES: tuple[FixStatus, ...] = ("ok", "too-few", "no-convergence", "inconsistent", "ambiguous")
 """What the numbers in `Fixes.status` mean."""
@@ -104,7 +109,8 @@ def fix_many(
     Raises
     ------
     ValueError
-        If shapes do not match, or a range that was heard has no variance above 0.
+        If shapes do not match; a place, a level or a range is not finite; a range is below 0 by more than noise makes
+        it where the clock is known; or the covariance of ranges heard is not positive, finite and symmetric.
     """
     anchors = np.ascontiguousarray(anchors_m, float)
     ranges = np.ascontiguousarray(ranges_m, float)
@@ -112,17 +118,24 @@ def fix_many(
         raise ValueError(f"anchors_m has shape {anchors.shape}; give one row of x, y, z an anchor: (b, 3)")
     if ranges.ndim != 2 or ranges.shape[1] != len(anchors):
         raise ValueError(f"ranges_m has shape {ranges.shape}; give a column an anchor: (n, {len(anchors)})")
+    if not np.all(np.isfinite(anchors)):
+        i = int(np.argmin(np.isfinite(anchors).all(axis=1)))
+        raise ValueError(f"anchors_m[{i}] is {anchors[i].tolist()}; give finite places, or leave the anchor out")
+    if level_m is not None and not np.isfinite(level_m):
+        raise ValueError(f"level_m {level_m}: give a finite level, or None where it is solved for")
     covariance, each = _covariances(np.asarray(covariance_m2, float), *ranges.shape)
+    _check_ranges(ranges, np.diagonal(covariance, axis1=1, axis2=2), clock)
     bounds = np.array([[-np.inf] * 3, [np.inf] * 3] if bounds_m is None else bounds_m, float)
     if bounds.shape != (2, 3) or not np.all(bounds[0] <= bounds[1]):
         raise ValueError(f"bounds_m {bounds_m}: give two corners of the room, the lower first: [[x, y, z], [x, y, z]]")
     flat, n = level_m is not None, len(ranges)
     places = [0, 1] + [2] * (not flat)
     index = np.array(places + [3] * clock)
-    limits = np.array([threshold(count - len(index)) for count in range(len(anchors) + 1)])
+    degrees = np.arange(len(anchors) + 1) - len(index)
+    limits = np.array([[threshold(int(d), rate) for d in degrees] for rate in (FALSE_ALARM, MENDED)])
     status, state, chi2 = np.zeros(n, np.int8), np.full((n, 4), np.nan), np.full(n, np.nan)
     spreads, used = np.full((n, len(index), len(index)), np.nan), np.zeros((n, len(anchors)), bool)
-    known = (flat, float(level_m or 0.0), clock, index)
+    known = (flat, float(level_m or 0.0), bool(clock), index)
     judge = (limits, AMBIGUOUS_CHI2, bounds_m is not None, bounds)
     bad = solve_all(anchors, ranges, covariance, each, known, judge, status, state, spreads, chi2, used)
     if bad >= 0:
@@ -144,16 +157,41 @@ def fix_many(
     return Fixes(states, status, state[:, :3], state[:, 3] if clock else None, spreads, chi2, used)
 
 
+def _check_ranges(ranges: Floats, variance: Floats, clock: bool) -> None:
+    """Refuse what would be solved to a wrong place without a word; ``variance`` (1 or n, b)."""
+    endless = np.isinf(ranges)
+    if endless.any():
+        e, i = np.argwhere(endless)[0]
+        raise ValueError(f"ranges_m[{e}, {i}] is {ranges[e, i]}; give NaN where an anchor was not heard")
+    bad = np.isfinite(ranges) & ~((variance > 0.0) & np.isfinite(variance))
+    if bad.any():
+        e, i = np.argwhere(bad)[0]
+        value = np.broadcast_to(variance, ranges.shape)[e, i]
+        raise ValueError(
+            f"covariance_m2 of epoch {e}, anchor {i} is {value}; give every range that was heard a variance above 0"
+        )
+    with np.errstate(invalid="ignore"):
+        negative = ranges < (-np.inf if clock else -NEGATIVE_SIGMA * np.sqrt(variance))
+    if negative.any():
+        e, i = np.argwhere(negative)[0]
+        raise ValueError(
+            f"ranges_m[{e}, {i}] is {ranges[e, i]}; a range is not negative: give NaN where an anchor was not heard, "
+            "or clock=True where all ranges of an epoch share an offset"
+        )
+
+
 def _covariances(given: Floats, n: int, b: int) -> tuple[Floats, bool]:
     """Return covariances (1 or n, b, b), and whether each epoch has its own."""
     if given.shape == (b,):
         return np.diag(given)[None], False
-    if given.shape == (b, b):
-        return np.ascontiguousarray(given)[None], False
-    if given.shape == (n, b):
+    if given.shape == (n, b) != (b, b):
         return given[:, :, None] * np.eye(b), True
-    if given.shape == (n, b, b):
-        return np.ascontiguousarray(given), True
+    if given.shape in ((b, b), (n, b, b)):
+        each = given.ndim == 3
+        whole = np.ascontiguousarray(given if each else given[None])
+        if not np.allclose(whole, whole.transpose(0, 2, 1), rtol=1e-6, atol=0.0, equal_nan=True):
+            raise ValueError("covariance_m2 is not symmetric; give the covariance of ranges, in m²")
+        return whole, each
     raise ValueError(f"covariance_m2 has shape {given.shape}; give ({b},), ({b}, {b}), ({n}, {b}) or ({n}, {b}, {b})")
 
 

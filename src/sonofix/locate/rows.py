@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import ALONE, CLOCK, PITCH, PITCH_RATE, ROLL, ROLL_RATE, SAME_ARM_M, SIZE, YAW, Links, expected
+from sonofix.locate.curved import least_biases
 from sonofix.locate.dense import spread, whitener
 from sonofix.locate.integrity import RISK, levels, threshold
 from sonofix.locate.noise import CLOCK_SPEED_SD, row_noise
@@ -20,6 +21,9 @@ from sonofix.records import Floats, RangeEpoch
 
 UNKNOWN_SPEED_MPS = 1.0
 """Deviation of the velocity (from 0) where no range rates tell of it: a walk."""
+
+ASTRAY_SIGMA = 3.0
+"""Deviations that a place may be off by at which the least bias noticed is told."""
 
 ROCKING_RADPS = 2.0
 """How fast a body that tilts rocks, one sigma."""
@@ -255,14 +259,12 @@ class Rows:
         return out if spread(found.jacobian, out) else None
 
     def bent(self, kept: NDArray[np.int64], found: Solution, covariance: Floats) -> Floats:
-        """What the bend of rows over the reach of roll and pitch adds to a covariance (k, k): a second-order term.
+        """What the bend of rows over the reach of roll and pitch adds to a covariance (k, k) of a body that tilts.
 
         A tilt that rows tell poorly swings ends on arcs, which the linear model takes for straight. All unknowns move
         with it as their covariance has it; what rows then show beyond the linear model, h = ½ H ξ² with ξ of unit
         variance and E(h²) = ¾ H², is noise of the rows (Bar-Shalom 2001, section 10.3.2).
         """
-        if not self.tilts:
-            return np.zeros_like(covariance)
         (rows, noise), unknowns = self._kept(kept), self._index
         tilt = np.isin(unknowns, (ROLL, PITCH))
         size, axes = np.linalg.eigh(covariance[np.ix_(tilt, tilt)])
@@ -298,6 +300,23 @@ class Rows:
         variance = self._speed_sd_mps**2
         told = max(1.0 - variance * float(left @ left), 0.0)
         return self._speed_mps + variance * float(shown @ miss), self._speed_sd_mps * float(np.sqrt(told))
+
+    def least_biases(self, kept: NDArray[np.int64], found: Solution, missed_rate: float) -> Floats:
+        """Biases (p, 2) of the rows kept, as `curved.least_biases` has them, of places where a solution may lie.
+
+        That is where it does, and `ASTRAY_SIGMA` of its deviations to either side along the position's widest axis.
+        """
+        (rows, covariance), out = self._kept(kept), np.empty((len(kept), 2))
+        at = (self._speed_mps, self.clock, covariance, self._index, self.level_m is not None, float(self.level_m or 0))
+        spreads, places = self.covariance(found), np.tile(found.state, (3, 1))
+        if spreads is not None:
+            axes = 2 if self.level_m is not None else 3
+            size, along = np.linalg.eigh(spreads[:axes, :axes])
+            shift = ASTRAY_SIGMA * spreads[:, :axes] @ along[:, -1] / np.sqrt(size[-1])
+            places[1, self._index] += shift
+            places[2, self._index] -= shift
+        least_biases(rows, *at, places, threshold(self.degrees(len(kept))), missed_rate, out)
+        return out
 
     def protection(
         self, kept: NDArray[np.int64], found: Solution, others: list[Solution], bounds_m: tuple | None

@@ -1,4 +1,4 @@
-"""Positions from ranges to fixed places, epoch after epoch in one compiled loop: the plain case of a fix (`many`).
+"""A position from ranges to fixed places, as kernels: the plain case of a fix, for `many`.
 
 States are x, y, z and the clock's offset (4,).
 """
@@ -8,15 +8,15 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.locate.dense import factor, spread, substitute, whitener
+from sonofix.locate.dense import factor, substitute
 from sonofix.locate.search import STEPS, mirror
 from sonofix.locate.start import MOST_STARTS, begin
 
 MOST = MOST_STARTS + 1
 """Solutions there may be: from each start and a mirror image."""
 
-TOO_FEW, OPEN_DIRECTION, AMBIGUOUS, ONE_BY_ONE = 1, 2, 4, 9
-"""What `solve_all` says of an epoch that is not solved; the last: that `fix` shall judge it."""
+TOO_FEW, OPEN_DIRECTION, INCONSISTENT, AMBIGUOUS, ONE_BY_ONE = 1, 2, 3, 4, 9
+"""What is said of an epoch where not all is well, as `many.STATUSES` counts; the last: that `fix` shall judge it."""
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -89,7 +89,8 @@ def descend(anchors, measured, whiten, index, known, state, work):
         for j in range(count):
             step[j] /= size[j]
             for k in range(j + 1):
-                normal[j, k] /= size[j] * size[k]
+                # one after the other: where a direction is open, the square of its size is 0
+                normal[j, k] = normal[j, k] / size[j] / size[k]
             normal[j, j] += damping
         downhill, new_chi2 = factor(normal), np.inf
         if downhill:
@@ -155,12 +156,12 @@ def solutions(anchors, measured, whiten, known, work, states, chi2s):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def choose(states, chi2s, found, judge):
+def choose(states, chi2s, found, judge, inflation):
     """Which solution holds, as `fix` tells mirror images apart; or, below 0, the negative of what to say of it."""
     _, alike_chi2, bounded, bounds = judge
     rivals, inside, chosen = 0, 0, 0
     for s in range(found):
-        if s > 0 and chi2s[s] >= chi2s[0] + alike_chi2:
+        if s > 0 and chi2s[s] >= chi2s[0] + alike_chi2 * inflation:
             continue
         rivals += s > 0
         within = True
@@ -186,77 +187,3 @@ def too_weak(measured, state, covariance, places):
     for j in range(places):
         widest = max(widest, covariance[j, j])
     return widest > (0.5 * max(nearest, 0.2)) ** 2
-
-
-@numba.njit(cache=True, error_model="numpy")
-def solve_all(anchors, ranges, covariance, each, known, judge, status, state, spreads, chi2, used):
-    """Solve epoch after epoch.
-
-    Parameters
-    ----------
-    anchors, ranges : float64 (b, 3), (n, b)
-    covariance : float64 (n, b, b) if ``each``, else (1, b, b)
-    known : tuple
-        Whether the level is known, it, whether the clock is not, and which of a state are unknown.
-    judge : tuple
-        χ² beyond which so many rows disagree (b + 1,), χ² within which two solutions are alike, whether there is a
-        room, and it (2, 3).
-    status, state, spreads, chi2, used : (n,), (n, 4), (n, k, k), (n,), (n, b), out
-        Left as they are where an epoch is not solved, the status aside.
-
-    Returns
-    -------
-    int
-        The epoch whose covariance is not positive, or −1.
-    """
-    n, most = ranges.shape
-    flat, count = known[0], len(known[3])
-    heard, last = np.empty(most, np.int64), -1
-    states, chi2s = np.empty((MOST, 4)), np.empty(MOST)
-    places, measured, whiten = np.empty((0, 3)), np.empty(0), np.empty((0, 0))
-    work = (measured, measured, whiten, whiten)
-    for e in range(n):
-        m, again = 0, last >= 0 and not each
-        for i in range(most):
-            there = np.isfinite(ranges[e, i])
-            if there:
-                heard[m] = i
-                m += 1
-            again = again and there == np.isfinite(ranges[last, i])
-        if m < count:
-            status[e] = TOO_FEW
-            continue
-        if not again:
-            places, measured, whiten, part = np.empty((m, 3)), np.empty(m), np.empty((m, m)), np.empty((m, m))
-            work = (np.empty(m), np.empty(m), np.empty((m, count)), np.empty((m, count)))
-            for i in range(m):
-                for axis in range(3):
-                    places[i, axis] = anchors[heard[i], axis]
-                for k in range(m):
-                    part[i, k] = covariance[e if each else 0, heard[i], heard[k]]
-            if not whitener(part, whiten):
-                return e
-        last = e
-        for i in range(m):
-            measured[i] = ranges[e, heard[i]]
-        found = solutions(places, measured, whiten, known, work, states, chi2s)
-        status[e] = OPEN_DIRECTION
-        if not found:
-            continue
-        if chi2s[0] > judge[0][m]:
-            status[e] = ONE_BY_ONE
-            continue
-        best = choose(states, chi2s, found, judge)
-        if best < 0:
-            status[e] = -best
-            continue
-        misfit(places, measured, whiten, known[3], states[best], work[0], work[2])
-        if not spread(work[2], spreads[e]) or too_weak(measured, states[best], spreads[e], 2 if flat else 3):
-            spreads[e] = np.nan
-            continue
-        status[e], chi2[e] = 0, chi2s[best]
-        for i in range(4):
-            state[e, i] = states[best, i]
-        for i in range(m):
-            used[e, heard[i]] = True
-    return -1
