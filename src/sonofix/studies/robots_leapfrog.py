@@ -1,0 +1,445 @@
+"""Leap-frog over 100 m in legs of 10 m: errors foreseen and found, against odometry and a published system.
+
+Three robots leave a strip of triangles behind them: the hindmost goes past the foremost to the other side, the others
+stand. Ranges have the covariance that the receiver states of bursts under a loud tone; then they are heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sonofix.records import Curve, Finding, Floats, Panel, Sheet
+from sonofix.studies import robots_stops
+from sonofix.studies.robots_stops import ROBOTS, Heard
+from sonofix.studies.work import batches, rms
+from sonofix.team import planner
+from sonofix.team.leapfrog import Formation, Leap, begin, leapt
+
+LENGTH_M, LEG_M, WIDTH_M = 100.0, 10.0, 10.0
+"""Each robot goes 10 m along at a time, 3.3 m past the foremost: triangles of 10.5 m and 6.7 m."""
+
+SPEED_SD = 5e-4
+"""Deviation of the speed of sound, a share: 0.3 K."""
+
+BASE_SD_M = 1e-3
+"""Of the distance from K to R2 at the start, where it is measured."""
+
+SNR_DB, TONE_DB = 6.0, 20.0
+"""Of a burst over noise in 4 kHz, and of the tone over a burst, 10 m away."""
+
+WAY_SD = 0.05
+"""Of a leap by odometry, a share; robots end their leaps as far from where they should."""
+
+WHEEL_SCALE_SD, WHEEL_TURN_SD = 0.01, np.radians(0.2)
+"""Odometry alone: ways too long by a constant share, and a heading that wanders (rad per √m)."""
+
+PUBLISHED = 1.2e-3
+"""Error over path of CPS-II (Kurazume & Hirose 2000, Autonomous Robots 8): robots with a laser, ranges and bearings."""
+
+WANTED = 1e-3
+"""Of the path."""
+
+PLANNED_SD_M = 0.06
+"""End error that the planner is asked for."""
+
+TRIES = 3
+BENCH_STOPS = 8
+
+
+class Ears(Protocol):
+    """Ranges among robots that stand at true places (3, 2), sound being slower than taken for by a share."""
+
+    def __call__(self, place_m: Floats, scale: float) -> Heard:
+        """Range all pairs."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One kind of run: the speed of sound's deviation, and that of a measured base or None."""
+
+    name: str
+    speed_sd: float
+    base_sd_m: float | None = None
+    step_m: float = LEG_M
+    width_m: float = WIDTH_M
+
+
+CASES = (
+    Case("speed of sound known", 0.0),
+    Case("known to 0.05 %", SPEED_SD),
+    Case("and K–R2 measured to 1 mm", SPEED_SD, BASE_SD_M),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One run, a leap a row.
+
+    Attributes
+    ----------
+    along_m : float64 (n,)
+        How far along the robot is that leapt.
+    miss_m : float64 (n, 2)
+        Its error.
+    covariance_m2 : float64 (n, 2, 2)
+        As stated.
+    scale_miss, scale_sd : float
+        Of the speed of sound at the end.
+    by_scale_m : float
+        Error at the end for each 1 of the scale's.
+    places_m : float64 (n + 3, 2)
+        Where robots stood, those of the start first.
+    again : int
+        Stops that had to be ranged anew.
+    """
+
+    along_m: Floats
+    miss_m: Floats
+    covariance_m2: Floats
+    scale_miss: float
+    scale_sd: float
+    by_scale_m: float
+    places_m: Floats
+    again: int
+
+
+def start_m(step_m: float = LEG_M, width_m: float = WIDTH_M) -> Floats:
+    """Return places (3, 2) of K, R2 and R1 at the start: as if the strip came from behind."""
+    return np.array([[i * step_m / 3, width_m / 2 * (-1.0, 1.0, -1.0)[i]] for i in range(3)])
+
+
+def course(step_m: float = LEG_M) -> planner.Course:
+    """Straight on; R1, the foremost, goes 100 m."""
+    return planner.Course(np.zeros(2), 0.0, LENGTH_M + 2 * step_m / 3)
+
+
+def drive(case: Case, ears: Ears, rng: np.random.Generator) -> Run:
+    """Do one run.
+
+    Raises
+    ------
+    RuntimeError
+        If a stop yields no place in `TRIES` attempts.
+    """
+    true = start_m(case.step_m, case.width_m)
+    scale = case.speed_sd * float(rng.standard_normal())
+    base = None
+    if case.base_sd_m is not None:
+        base = (float(np.hypot(*(true[1] - true[0])) + case.base_sd_m * rng.standard_normal()), case.base_sd_m)
+    heard = ears(true, scale)
+    # roughly where they stand: each within a metre of that
+    rough = true + rng.uniform(-0.5, 0.5, (3, 2)) * np.array([[0.0], [0.0], [1.0]])
+    found = begin(ROBOTS, rough, heard.pairs, heard.range_m, heard.covariance_m2, case.speed_sd, base)
+    if found.status != "ok":
+        raise RuntimeError(f"the start: {found.remedy}")
+    now, way, again, arrived = found.formation, course(case.step_m), 0, False
+    along, miss, spread, places = [], [], [], [*true]
+    robot = planner.hindmost(now, way)
+    while not arrived:
+        robot = planner.hindmost(now, way)
+        who = now.index(robot)
+        to_m = planner.landing(now, robot, way, case.step_m, case.width_m)
+        # the last leap is the one that is meant to end there
+        arrived = bool(way.along_and_across(to_m)[0] >= way.length_m - 1e-6)
+        meant = to_m - now.place_m[who]
+        way_sd = WAY_SD * float(np.hypot(*meant))
+        true[who] += meant + way_sd * rng.standard_normal(2)
+        leap, tries = _leapt(now, robot, meant, way_sd, ears, true, scale)
+        if leap.status != "ok":
+            raise RuntimeError(f"{robot} after {len(along)} leaps: {leap.remedy}")
+        now, again = leap.formation, again + tries - 1
+        along.append(float(now.place_m[who, 0]))
+        miss.append(now.place_m[who] - true[who])
+        spread.append(now.covariance_m2(robot))
+        places.append(true[who].copy())
+    return Run(
+        along_m=np.array(along),
+        miss_m=np.array(miss),
+        covariance_m2=np.array(spread),
+        scale_miss=now.scale - scale,
+        scale_sd=now.scale_sd,
+        by_scale_m=float(np.hypot(*now.by_scale_m(robot))),
+        places_m=np.array(places),
+        again=again,
+    )
+
+
+def _leapt(
+    now: Formation, robot: str, meant: Floats, way_sd: float, ears: Ears, true: Floats, scale: float
+) -> tuple[Leap, int]:
+    """Range a robot that has leapt, anew where that gives no place; with the number of tries."""
+    for tries in range(1, TRIES):
+        heard = ears(true, scale)
+        leap = leapt(now, robot, meant, way_sd**2 * np.eye(2), heard.pairs, heard.range_m, heard.covariance_m2)
+        if leap.status == "ok":
+            return leap, tries
+    heard = ears(true, scale)
+    return leapt(now, robot, meant, way_sd**2 * np.eye(2), heard.pairs, heard.range_m, heard.covariance_m2), TRIES
+
+
+def stated(ranging: planner.Ranging, rng: np.random.Generator) -> Ears:
+    """Ears that draw ranges of a stated covariance."""
+    pairs = (("K", "R2"), ("K", "R1"), ("R2", "R1"))
+
+    def ears(place_m: Floats, scale: float) -> Heard:
+        distance = np.array([np.hypot(*(place_m[ROBOTS.index(b)] - place_m[ROBOTS.index(a)])) for a, b in pairs])
+        noise = ranging.covariance_m2(distance)
+        drawn = (1.0 + scale) * distance + np.sqrt(np.diag(noise)) * rng.standard_normal(len(pairs))
+        return Heard(pairs, drawn, noise)
+
+    return ears
+
+
+def hearing(bench: robots_stops.Bench, rng: np.random.Generator) -> Ears:
+    """Ears that simulate bursts and hear them."""
+    return lambda place_m, scale: robots_stops.stop(bench, place_m, scale, rng.integers(2**31, size=2).tolist())
+
+
+def heard_run(bench: robots_stops.Bench, number: int, seed: int) -> Run:
+    """Run from waveforms, the speed of sound known to `SPEED_SD`."""
+    rng = np.random.default_rng([seed, 31, number])
+    return drive(CASES[1], hearing(bench, rng), rng)
+
+
+def calibrated(bench: robots_stops.Bench, seed: int) -> tuple[planner.Ranging, Floats, Floats]:
+    """Measure how well robots range each other 10 m apart: the model, and errors (stops, 3) and stated deviations."""
+    place = robots_stops.AT_M * np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])
+    heard = [robots_stops.stop(bench, place, 0.0, (seed, 32, k)) for k in range(BENCH_STOPS)]
+    whole = [h for h in heard if len(h.pairs) == 3]
+    miss = np.array([h.range_m - robots_stops.AT_M for h in whole])
+    sd = np.sqrt(np.array([np.diag(h.covariance_m2) for h in whole]))
+    model = planner.Ranging(
+        float(np.sqrt(np.mean(sd**2))), robots_stops.AT_M, robots_stops.ABSORPTION_DB_PER_M, robots_stops.REACH_M
+    )
+    return model, miss, sd
+
+
+def wheels_alone(numbers: range, seed: int) -> Floats:
+    """Errors (runs, 100, 2) of odometry alone, after each metre of R1's way straight on."""
+    out = []
+    for run in numbers:
+        rng = np.random.default_rng([seed, 33, run])
+        steps = round(LENGTH_M)
+        heading = np.cumsum(WHEEL_TURN_SD * rng.standard_normal(steps))
+        told = (1 + WHEEL_SCALE_SD * rng.standard_normal()) * np.column_stack([np.cos(heading), np.sin(heading)])
+        out.append(np.cumsum(told, axis=0) - np.column_stack([np.arange(1.0, steps + 1), np.zeros(steps)]))
+    return np.array(out)
+
+
+def ratio(miss_m: Floats, covariance_m2: Floats, case: str) -> Finding:
+    """Root mean square of errors (runs, 2) over that of stated deviations (runs, 2, 2)."""
+    sd = float(np.sqrt(np.mean(np.trace(covariance_m2, axis1=1, axis2=2))))
+    return rms(miss_m * np.sqrt(2.0) / sd, case, "error over its deviation", "1", "0.7 to 1.4")
+
+
+class Leapfrog:
+    """The study in progress."""
+
+    def __init__(self, runs: int, seed: int, waveforms: int) -> None:
+        self._wanted, self._seed, self._drives = runs, seed, waveforms
+        self._bench = robots_stops.bench(SNR_DB, TONE_DB)
+        self._ranging: planner.Ranging | None = None
+        self._checked: tuple[Floats, Floats] | None = None
+        self._plan: planner.Plan | None = None
+        self._cases: tuple[Case, ...] = CASES
+        self._done: dict[str, list[Run]] = {}
+        self._wheels: list[Floats] = []
+        self._heard: list[Run] = []
+        self._scan: list[Curve] = []
+
+    def work(self) -> Iterator[tuple[str, float]]:
+        """Measure ranges, plan, compute the runs, then those from waveforms."""
+        self._ranging, *checked = calibrated(self._bench, self._seed)
+        self._checked = (checked[0], checked[1])
+        known = _formation(self._ranging, 0.0)
+        self._plan = planner.plan(known, course(), self._ranging, PLANNED_SD_M, WAY_SD)
+        self._cases = (*CASES, Case("as planned", 0.0, None, self._plan.step_m, self._plan.width_m))
+        self._scan = _scan(self._ranging)
+        for numbers in batches(self._wanted):
+            for k, case in enumerate(self._cases):
+                for run in numbers:
+                    rng = np.random.default_rng([self._seed, 30, k, run])
+                    self._done.setdefault(case.name, []).append(drive(case, stated(self._ranging, rng), rng))
+                    share = (
+                        numbers.start + (k + (run - numbers.start) / len(numbers)) * len(numbers) / 4
+                    ) / self._wanted
+                    yield "by ranges", min(1.0, share)
+            self._wheels.append(wheels_alone(numbers, self._seed))
+            yield "by ranges", numbers.stop / self._wanted
+        for number in range(self._drives):
+            self._heard.append(heard_run(self._bench, number, self._seed))
+            yield "from waveforms", (number + 1) / self._drives
+
+    def sheet(self) -> Sheet | None:
+        """Show what is finished."""
+        if self._ranging is None or self._plan is None or any(c.name not in self._done for c in self._cases):
+            return None
+        panels = (
+            self._along(),
+            self._strip(),
+            self._by_speed(),
+            Panel(
+                "What the planner weighs",
+                "speed of sound known; lines by the strip's width",
+                "each robot's step along, m",
+                "foreseen end error (1 σ), m",
+                (*self._scan, Curve("asked for", _ENDS_M, np.full(2, PLANNED_SD_M), "bound")),
+                (1e-2, 2.0),
+                logarithmic=True,
+            ),
+        )
+        note = (
+            f"three robots go {LENGTH_M:g} m in legs of {LEG_M:g} m; 40 kHz bursts under a tone {TONE_DB:g} dB louder"
+        )
+        return Sheet("Robots: leap-frog", note, 2, panels, self._findings())
+
+    def _findings(self) -> tuple[Finding, ...]:
+        assert self._checked is not None
+        assert self._plan is not None
+        miss, sd = self._checked
+        at = f"ranges over {robots_stops.AT_M:g} m, from waveforms"
+        out = [rms(miss, at, "rms", "m"), rms(miss / sd, at, "error over its deviation", "1", "1")]
+        for case in self._cases:
+            out += _ends(self._done[case.name], case)
+        if self._heard:
+            out += _ends(self._heard, Case(f"from waveforms, {CASES[1].name}", SPEED_SD))
+            again = float(np.mean([run.again for run in self._heard]))
+            out.append(Finding("from waveforms", "stops ranged anew, a run", again, None, "1", len(self._heard)))
+        wheels = np.concatenate(self._wheels) if self._wheels else wheels_alone(range(1), self._seed)
+        out.append(rms(wheels[:, -1] * np.sqrt(2.0), "odometry alone", "end error, rms", "m"))
+        runs = self._done[CASES[1].name]
+        per_step = 1e-4 * float(np.mean([run.by_scale_m for run in runs]))
+        out.append(
+            Finding("0.01 % of the speed of sound", "end error it makes", per_step, None, "m", len(runs), "1 cm")
+        )
+        planned = f"planner, asked for {100 * PLANNED_SD_M:g} cm"
+        out += [
+            Finding(planned, "leaps", float(self._plan.leaps), None, "1", 1),
+            Finding(planned, "end error foreseen", self._plan.end_sd_m, None, "m", 1),
+        ]
+        return tuple(out)
+
+    def _along(self) -> Panel:
+        """Errors over the way."""
+        runs = self._done[CASES[1].name]
+        x, found, foreseen = _by_way(runs)
+        curves = [
+            Curve("odometry alone", *_wheels_by_way(self._wheels, self._seed), "alone"),
+            Curve("leap-frog", x, found, "result"),
+            Curve("its stated deviation", x, foreseen, "truth"),
+            Curve("0.12 % of path (CPS-II)", x, PUBLISHED * x, "bound"),
+        ]
+        if self._heard:
+            curves.insert(2, Curve("from waveforms", *_by_way(self._heard)[:2], "raw"))
+        note = f"{CASES[1].name}; root mean squares over runs"
+        return Panel("Error along the way", note, "way, m", "error, m", tuple(curves), (1e-3, 100.0), logarithmic=True)
+
+    def _strip(self) -> Panel:
+        """Where robots stood in one run, and what odometry alone would have made of the way."""
+        run = self._done[CASES[1].name][0]
+        places = run.places_m
+        wheels = self._wheels[0][0] if self._wheels else wheels_alone(range(1), self._seed)[0]
+        reckoned = wheels + np.column_stack([np.arange(1.0, len(wheels) + 1), np.zeros(len(wheels))])
+        curves = [Curve("odometry alone", reckoned[:, 0], reckoned[:, 1], "alone")]
+        for i, robot in enumerate(ROBOTS):
+            own = places[i::3]
+            curves.append(Curve(robot, own[:, 0], own[:, 1], ("result", "bound", "raw")[i]))
+        return Panel(
+            "Where they stood", "one run; leaps cross the course", "x, m", "y, m", tuple(curves), (-25.0, 25.0)
+        )
+
+    def _by_speed(self) -> Panel:
+        """How the end error grows with the doubt about the speed of sound."""
+        assert self._ranging is not None
+        sds = np.linspace(0.0, 2e-3, 21)
+        ends = np.array([_end_sd_m(_formation(self._ranging, sd), self._ranging) for sd in sds])
+        based = np.array([_end_sd_m(_formation(self._ranging, sd, BASE_SD_M), self._ranging) for sd in sds])
+        curves = [
+            Curve("foreseen", 100 * sds, ends, "truth"),
+            Curve("K–R2 measured to 1 mm", 100 * sds, based, "result"),
+            Curve("0.1 % of path", 100 * sds[[0, -1]], np.full(2, WANTED * LENGTH_M), "bound"),
+        ]
+        found = [(c, _end_rms_m(self._done[c.name])) for c in CASES]
+        curves.append(
+            Curve("found", 100 * np.array([c.speed_sd for c, _ in found]), np.array([v for _, v in found]), "raw")
+        )
+        note = "a scale error, common to all: it grows with the way"
+        return Panel(
+            "Doubt about the speed of sound", note, "its deviation, %", "end error, m", tuple(curves), (0.0, 0.22)
+        )
+
+
+_ENDS_M = np.array([planner.STEPS_M[0], planner.STEPS_M[-1]])
+_KINDS = ("alone", "result", "raw")
+
+
+def _formation(ranging: planner.Ranging, speed_sd: float, base_sd_m: float | None = None) -> Formation:
+    """What is known at the start, by ranges that happen to be right."""
+    true = start_m()
+    pairs = (("K", "R2"), ("K", "R1"), ("R2", "R1"))
+    distance = np.array([np.hypot(*(true[ROBOTS.index(b)] - true[ROBOTS.index(a)])) for a, b in pairs])
+    base = None if base_sd_m is None else (float(distance[0]), base_sd_m)
+    return begin(ROBOTS, true, pairs, distance, ranging.covariance_m2(distance), speed_sd, base).formation
+
+
+def _end_sd_m(formation: Formation, ranging: planner.Ranging, step_m: float = LEG_M, width_m: float = WIDTH_M) -> float:
+    """Deviation that the course would end with; NaN where out of reach."""
+    tried = planner.ahead(formation, course(), ranging, WAY_SD, step_m, width_m)
+    return np.nan if tried is None else tried[1][-1].sd_m(tried[0][-1][0])
+
+
+def _scan(ranging: planner.Ranging) -> list[Curve]:
+    """End errors by step and width."""
+    steps, known = np.array(planner.STEPS_M), _formation(ranging, 0.0)
+    return [
+        Curve(f"{width:g} m", steps, np.array([_end_sd_m(known, ranging, step, width) for step in steps]), kind)
+        for width, kind in zip((7.5, 10.0, 15.0), _KINDS, strict=True)
+    ]
+
+
+def _ends(runs: Sequence[Run], case: Case) -> list[Finding]:
+    """What is to be told of runs of one kind: their ends."""
+    miss = np.array([run.miss_m[-1] for run in runs])
+    spread = np.array([run.covariance_m2[-1] for run in runs])
+    nees = np.einsum("ri,ri->r", miss, np.linalg.solve(spread, miss[..., None])[..., 0])
+    out = [
+        rms(miss * np.sqrt(2.0), case.name, "end error, rms", "m"),
+        rms(miss * np.sqrt(2.0) / LENGTH_M, case.name, "end error over path", "", "at most 0.1 %; CPS-II 0.12 %"),
+        ratio(miss, spread, case.name),
+        Finding(case.name, "NEES of x, y", float(nees.mean()), _standard_error(nees), "1", len(runs), "2"),
+    ]
+    if case.speed_sd:
+        off = np.array([[run.scale_miss] for run in runs])
+        sd = float(np.mean([run.scale_sd for run in runs]))
+        out.append(rms(off, case.name, "error of the speed of sound", "", f"{100 * sd:.2g} %"))
+    return out
+
+
+def _standard_error(values: Floats) -> float | None:
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+
+
+def _end_rms_m(runs: Sequence[Run]) -> float:
+    return float(np.sqrt(np.mean([run.miss_m[-1] @ run.miss_m[-1] for run in runs])))
+
+
+def _by_way(runs: Sequence[Run]) -> tuple[Floats, Floats, Floats]:
+    """Middles of stretches of the way, errors found and stated there (root mean squares)."""
+    along = np.concatenate([run.along_m for run in runs]) - 2 * LEG_M / 3
+    square = np.concatenate([np.sum(run.miss_m**2, axis=1) for run in runs])
+    stated = np.concatenate([np.trace(run.covariance_m2, axis1=1, axis2=2) for run in runs])
+    edges = np.arange(0.0, LENGTH_M + 10.0, 5.0)
+    which = np.digitize(along, edges)
+    filled = [k for k in range(1, len(edges)) if np.any(which == k)]
+    means = np.array([[v[which == k].mean() for v in (along, square, stated)] for k in filled])
+    return means[:, 0], np.sqrt(means[:, 1]), np.sqrt(means[:, 2])
+
+
+def _wheels_by_way(done: Sequence[Floats], seed: int) -> tuple[Floats, Floats]:
+    off = np.concatenate(done) if done else wheels_alone(range(1), seed)
+    return np.arange(1.0, LENGTH_M + 1), np.sqrt(np.mean(np.sum(off**2, axis=2), axis=0))
