@@ -138,7 +138,7 @@ def drive(case: Case, ears: Ears, rng: np.random.Generator) -> Run:
     if found.status != "ok":
         raise RuntimeError(f"the start: {found.remedy}")
     now, way, again, arrived = found.formation, course(case.step_m), 0, False
-    along, miss, spread, places = [], [], [], [*true]
+    along, miss, spread, places = [], [], [], [*true.copy()]
     robot = planner.hindmost(now, way)
     while not arrived:
         robot = planner.hindmost(now, way)
@@ -329,13 +329,13 @@ class Leapfrog:
         runs = self._done[CASES[1].name]
         x, found, foreseen = _by_way(runs)
         curves = [
-            Curve("odometry alone", *_wheels_by_way(self._wheels, self._seed), "alone"),
+            Curve("odometry", *_wheels_by_way(self._wheels, self._seed), "alone"),
             Curve("leap-frog", x, found, "result"),
-            Curve("its stated deviation", x, foreseen, "truth"),
-            Curve("0.12 % of path (CPS-II)", x, PUBLISHED * x, "bound"),
+            Curve("stated", x, foreseen, "truth"),
+            Curve("CPS-II, 0.12 %", x, PUBLISHED * x, "bound"),
         ]
         if self._heard:
-            curves.insert(2, Curve("from waveforms", *_by_way(self._heard)[:2], "raw"))
+            curves.insert(2, Curve("waveforms", *_by_way(self._heard)[:2], "raw"))
         note = f"{CASES[1].name}; root mean squares over runs"
         return Panel("Error along the way", note, "way, m", "error, m", tuple(curves), (1e-3, 100.0), logarithmic=True)
 
@@ -345,13 +345,13 @@ class Leapfrog:
         places = run.places_m
         wheels = self._wheels[0][0] if self._wheels else wheels_alone(range(1), self._seed)[0]
         reckoned = wheels + np.column_stack([np.arange(1.0, len(wheels) + 1), np.zeros(len(wheels))])
-        curves = [Curve("odometry alone", reckoned[:, 0], reckoned[:, 1], "alone")]
-        for i, robot in enumerate(ROBOTS):
-            own = places[i::3]
-            curves.append(Curve(robot, own[:, 0], own[:, 1], ("result", "bound", "raw")[i]))
-        return Panel(
-            "Where they stood", "one run; leaps cross the course", "x, m", "y, m", tuple(curves), (-25.0, 25.0)
+        curves = (
+            Curve("odometry alone", reckoned[:, 0], reckoned[:, 1], "alone"),
+            Curve("stops of all, in order", places[:, 0], places[:, 1], "result"),
+            Curve("of R1", places[2::3, 0], places[2::3, 1], "raw"),
         )
+        note = "one run; each leap crosses the course"
+        return Panel("Where they stood", note, "x, m", "y, m", curves, (-25.0, 25.0))
 
     def _by_speed(self) -> Panel:
         """How the end error grows with the doubt about the speed of sound."""
@@ -364,10 +364,9 @@ class Leapfrog:
             Curve("K–R2 measured to 1 mm", 100 * sds, based, "result"),
             Curve("0.1 % of path", 100 * sds[[0, -1]], np.full(2, WANTED * LENGTH_M), "bound"),
         ]
-        found = [(c, _end_rms_m(self._done[c.name])) for c in CASES]
-        curves.append(
-            Curve("found", 100 * np.array([c.speed_sd for c, _ in found]), np.array([v for _, v in found]), "raw")
-        )
+        known, doubted, based_found = (_end_rms_m(self._done[case.name]) for case in CASES)
+        x = 100 * SPEED_SD * np.array([0.0, 1.0, 1.0, 1.0])
+        curves.append(Curve("found", x, np.array([known, doubted, np.nan, based_found]), "raw"))
         note = "a scale error, common to all: it grows with the way"
         return Panel(
             "Doubt about the speed of sound", note, "its deviation, %", "end error, m", tuple(curves), (0.0, 0.22)

@@ -312,7 +312,7 @@ def _updated(formation: Formation, pairs: Sequence[Pair], range_m: Floats, noise
 
 def _expected(formation: Formation, state: Floats, pairs: Sequence[Pair]) -> tuple[Floats, Floats]:
     """Ranges (n,) that a state shows, and their derivative (n, 2 N + 1)."""
-    ends = np.array([(formation.index(a), formation.index(b)) for a, b in pairs], np.int64)
+    ends = np.array([(formation.index(a), formation.index(b)) for a, b in pairs], np.int64).reshape(-1, 2)
     place, rows = state[:-1].reshape(-1, 2), np.arange(len(pairs))
     apart = place[ends[:, 1]] - place[ends[:, 0]]
     distance = np.maximum(np.hypot(apart[:, 0], apart[:, 1]), 1e-9)
