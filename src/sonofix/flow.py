@@ -78,7 +78,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
         epochs = exchange_epochs(recording.tables["exchanges"], recording.site)
     else:
         raise ValueError(
-            "the recording holds neither samples (capture.flac, capture.wav), ranges.csv nor exchanges.csv"
+            "the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv nor exchanges.csv"
         )
     street = Street(recording.site, recording.tables.get("start"), rate_hz)
     street.sense(recording.tables, _stated_pairs(recording))

@@ -7,8 +7,8 @@ exchanges, and robots that stand, that is double-sided two-way ranging: Neirynck
 each exchange's own two ranges, A to B and B to A, each at the instant it was heard, and their covariance: the sum is as
 good as what was heard, and the difference as good as the clock is known.
 
-Robots that drive one behind the other make r1 and r2 differ as an offset does: r1 − r2 = (r / c) u · (v_A + v_B), u from A
-to B, beside what the range changes in between. That is followed too, and limits what is known of the clock.
+Robots that drive one behind the other make r1 and r2 differ as an offset does: r1 − r2 = (r / c) u · (v_A + v_B), u
+from A to B, beside what the range changes in between. That is followed too, and limits what is known of the clock.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ DRIFT_WANDER = 1e-8
 ACCELERATION_PSD = 0.5
 """Of range, m²/s³: as briskly as a track takes vehicles to move."""
 
-CRUISE, CRUISE_S = 1.0 / 3.0, 10.0
-"""Deviation of the sum of both velocities along the line between, a share of the sum of highest speeds; and how long one
-holds: a first-order Gauss-Markov process."""
+CRUISE, CRUISE_S = 0.5, 60.0
+"""Deviation of the sum of both velocities along the line between, a share of the sum of highest speeds; and how long
+one holds: a first-order Gauss-Markov process."""
 
 MAX_SPEED_MPS = 3.0
 """Of a vehicle whose site file states none."""
@@ -107,6 +107,12 @@ class PairClock:
     def ahead_s(self, time_s: float) -> float:
         """What B's clock shows beyond A's, at a time on A's."""
         return float(self.mean[2] + self.mean[3] * (time_s - self.time_s)) / self._c
+
+    def behind_s(self, shown_s: float) -> float:
+        """What A's clock shows less than B's, when B's shows a time."""
+        drift = float(self.mean[3]) / self._c
+        at_s = (shown_s - float(self.mean[2]) / self._c + drift * self.time_s) / (1.0 + drift)
+        return shown_s - at_s
 
     def take(
         self, sent_s: float, heard_s: float, reply_sent_s: float, reply_heard_s: float, sd_m: Floats | None
@@ -266,7 +272,7 @@ class TwoWay:
             stamps = (*stamps[2:], *stamps[:2])
             sd = None if sd is None else sd[::-1]
             scales = None if scales is None else scales[::-1]
-            snr = None if snr is None else snr[::-1]
+            snr = None if snr is None else (snr[1], snr[0])
         c = self._site.sound_speed_mps
         pair = (names[0], names[1])
         if pair not in self._clocks:
@@ -302,12 +308,7 @@ class TwoWay:
                 if name not in (a, b) or other in seen or not clock.known:
                     continue
                 seen.add(other)
-                if name == a:
-                    waiting.append((other, at_s + clock.ahead_s(at_s)))
-                else:
-                    # twice does: the offset changes by a ten-thousandth of itself
-                    back_s = at_s - clock.ahead_s(at_s - clock.ahead_s(at_s))
-                    waiting.append((other, back_s))
+                waiting.append((other, at_s + clock.ahead_s(at_s) if name == a else at_s - clock.behind_s(at_s)))
         return None
 
     def epoch(self, index: int, ranges: Iterable[TwoRanges], flags: tuple[str, ...] = ()) -> RangeEpoch | None:

@@ -7,7 +7,7 @@ own clock has it leave. Once heard, it is expected a period later, give or take 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.epochs import screen
 from sonofix.acquire.plan import Plan, acquire
+from sonofix.acquire.tones import MARGIN_S
 from sonofix.records import Detection, Exchange, Waveform
 from sonofix.site import Beacon, Microphone, Site
 
@@ -24,6 +25,9 @@ CLOCKS = 2e-4
 
 SLACK_S = 2e-3
 """Wider than what clocks and motion ask for."""
+
+LEAST_S = 10 * MARGIN_S
+"""Length below which a stretch is widened: tones are told from bursts by outlasting them."""
 
 FORGOTTEN = 8
 """Epochs of silence after which a burst is looked for all over again."""
@@ -62,13 +66,11 @@ class Peers:
 
     def ends_s(self, epoch: int) -> float:
         """When all of an epoch's samples are there, on every clock."""
-        closes = [self._window(epoch, m, e)[1] for m in self.microphones for e in self._emitters(m)]
-        return max(closes, default=0.0) + self._plan.burst_s + self._plan.margin_s
+        return max((span[1] for span in self._spans_s(epoch)), default=0.0)
 
     def begins_s(self, epoch: int) -> float:
         """When the first of an epoch's samples is due, on any clock."""
-        opens = [self._window(epoch, m, e)[0] for m in self.microphones for e in self._emitters(m)]
-        return min(opens, default=0.0) - self._plan.margin_s
+        return min((span[0] for span in self._spans_s(epoch)), default=0.0)
 
     def hear(
         self, epoch: int, samples: NDArray[np.float32], first: int
@@ -92,8 +94,7 @@ class Peers:
             windows = {e: self._window(epoch, microphone, e) for e in self._emitters(microphone)}
             if not windows:
                 continue
-            opens_s = min(w[0] for w in windows.values()) - self._plan.margin_s
-            closes_s = max(w[1] for w in windows.values()) + self._plan.burst_s + self._plan.margin_s
+            opens_s, closes_s = self._span_s(windows.values())
             begin = max(0, round(opens_s * rate) - first)
             own = samples[begin : max(begin, round(closes_s * rate) - first), microphone.channel]
             if not own.size:
@@ -144,6 +145,17 @@ class Peers:
         ear = next((m for m in ears if m.id == on.id), ears[0] if ears else None)
         found = None if ear is None else heard.get((emitter.id, ear.id))
         return None if ear is None or found is None else (ear, found)
+
+    def _spans_s(self, epoch: int) -> list[tuple[float, float]]:
+        windows = [[self._window(epoch, m, e) for e in self._emitters(m)] for m in self.microphones]
+        return [self._span_s(own) for own in windows if own]
+
+    def _span_s(self, windows: Collection[tuple[float, float]]) -> tuple[float, float]:
+        """Samples wanted of a channel: all bursts that begin within windows, margins, and enough to know a tone by."""
+        opens = min(w[0] for w in windows) - self._plan.margin_s
+        closes = max(w[1] for w in windows) + self._plan.burst_s + self._plan.margin_s
+        wider = max(0.0, LEAST_S - (closes - opens)) / 2
+        return opens - wider, closes + wider
 
     def _emitters(self, microphone: Microphone) -> list[str]:
         return [b.id for b in self._beacons.values() if b.vehicle != microphone.vehicle]

@@ -28,7 +28,10 @@ COLUMNS = {
     "events.csv": "time_s,vehicle,event,detail",
 }
 
-EXCHANGE_COLUMNS = "from,to,sent_s,heard_s,reply_sent_s,reply_heard_s,heard_sd_s,reply_heard_sd_s"
+EXCHANGE_COLUMNS = (
+    *("from", "to", "sent_s", "heard_s", "reply_sent_s", "reply_heard_s"),
+    *("heard_sd_s", "reply_heard_sd_s"),
+)
 """What exchanges.csv has, which only sites with clocks of their own come with."""
 
 TILT_COLUMNS = "roll_rad,pitch_rad,sd_roll_rad,sd_pitch_rad"
@@ -120,7 +123,7 @@ class RunWriter:
             for name in COLUMNS:
                 self._files[name] = _RowFile(self.out / name, _header(name, self._tilts), ",")
             if self._site.own_clocks:
-                self._files["exchanges.csv"] = _RowFile(self.out / "exchanges.csv", EXCHANGE_COLUMNS.split(","), ",")
+                self._files["exchanges.csv"] = _RowFile(self.out / "exchanges.csv", [*EXCHANGE_COLUMNS], ",")
             for vehicle in self._site.vehicles:
                 self._files[f"tum {vehicle.id}"] = _RowFile(self.out / _tum_name(self._site, vehicle.id), None, " ")
         except BaseException:
