@@ -13,8 +13,9 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 
-from sonofix.studies import robots_leapfrog as leapfrog
 from sonofix.studies import robots_stops
+from sonofix.studies import robots_strip as leapfrog
+from sonofix.studies.robots_leapfrog import WANTED
 
 pytestmark = pytest.mark.prove
 
@@ -54,5 +55,5 @@ def test_table_of_leapfrog_from_waveforms() -> None:
         )
         ratios.append((rms, rms / stated))
     rms, over = ratios[0]
-    assert rms <= leapfrog.WANTED * leapfrog.LENGTH_M
+    assert rms <= WANTED * leapfrog.LENGTH_M
     assert 0.7 <= over <= 1.4

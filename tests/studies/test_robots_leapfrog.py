@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sonofix.records import Finding, Sheet
-from sonofix.studies import begin, robots_leapfrog, robots_stops
+from sonofix.studies import begin, robots_leapfrog, robots_stops, robots_strip
 
 RUNS = 40
 
@@ -27,16 +27,16 @@ def named(sheet: Sheet) -> dict[tuple[str, str], Finding]:
 
 def test_ranges_heard_under_a_tone_err_as_stated() -> None:
     """Twenty-four squares of normal errors: their root mean square scatters by 1 / √48."""
-    bench = robots_stops.bench(robots_leapfrog.SNR_DB, robots_leapfrog.TONE_DB)
-    ranging, miss, sd = robots_leapfrog.calibrated(bench, 5)
-    assert miss.shape == (robots_leapfrog.BENCH_STOPS, 3)
+    bench = robots_stops.bench(robots_strip.SNR_DB, robots_strip.TONE_DB)
+    ranging, miss, sd = robots_strip.calibrated(bench, 5)
+    assert miss.shape == (robots_strip.BENCH_STOPS, 3)
     assert abs(np.sqrt(np.mean((miss / sd) ** 2)) - 1.0) < 4 / np.sqrt(2 * miss.size)
     assert 0.0005 < ranging.sd_m < 0.005
 
 
 def test_a_stop_hears_the_speed_of_sound_and_the_tone_is_what_is_stated() -> None:
     bench = robots_stops.bench(30.0, 20.0)
-    heard = robots_stops.stop(bench, robots_leapfrog.start_m(), 0.01, (1, 2), epochs=1)
+    heard = robots_stops.stop(bench, robots_strip.START_M, 0.01, (1, 2), epochs=1)
     assert heard.pairs == (("K", "R2"), ("K", "R1"), ("R2", "R1"))
     true = 1.01 * np.array([np.hypot(10 / 3, 10.0), 20 / 3, np.hypot(10 / 3, 10.0)])
     np.testing.assert_allclose(heard.range_m, true, atol=5 * np.sqrt(np.diag(heard.covariance_m2)).max())
@@ -46,7 +46,7 @@ def test_a_stop_hears_the_speed_of_sound_and_the_tone_is_what_is_stated() -> Non
 
 def test_errors_are_as_stated_and_within_a_thousandth_of_the_path(sheet: Sheet) -> None:
     found = named(sheet)
-    for case in robots_leapfrog.CASES:
+    for case in robots_strip.CASES:
         # of 2 n normal errors in all, in one direction mostly
         assert abs(found[case.name, "error over its deviation"].value - 1.0) < 4 / np.sqrt(2 * RUNS)
         assert found[case.name, "end error over path"].value < 1e-3
@@ -57,7 +57,7 @@ def test_the_speed_of_sound_costs_its_share_of_the_way_and_a_base_tells_it(sheet
     found = named(sheet)
     # a hundred metres and the strip's own length
     assert found["0.01 % of the speed of sound", "end error it makes"].value == pytest.approx(0.0107, abs=0.0003)
-    doubted, based = (found[case.name, "error of the speed of sound"] for case in robots_leapfrog.CASES[1:])
+    doubted, based = (found[case.name, "error of the speed of sound"] for case in robots_strip.CASES[1:])
     assert doubted.value == pytest.approx(5e-4, rel=4 / np.sqrt(2 * RUNS))
     assert based.value < 0.6 * doubted.value
 
@@ -78,7 +78,7 @@ def test_panels_show_growth_and_places(sheet: Sheet) -> None:
     assert (by_name["leap-frog"].y[4:] < by_name["CPS-II, 0.12 %"].y[4:]).all()
     stops = next(curve for curve in strip.curves if curve.name == "stops of all, in order")
     assert stops.x[0] == 0.0
-    assert stops.x[-1] == pytest.approx(robots_leapfrog.course().length_m, abs=4.0)
+    assert stops.x[-1] == pytest.approx(robots_strip.COURSE.length_m, abs=4.0)
     assert {curve.name for curve in speed.curves} >= {"foreseen", "found"}
     assert planned.logarithmic
 
@@ -86,4 +86,4 @@ def test_panels_show_growth_and_places(sheet: Sheet) -> None:
 def test_a_robot_that_hears_nobody_ends_the_run_with_a_reason() -> None:
     deaf = robots_stops.Heard((), np.zeros(0), np.zeros((0, 0)))
     with pytest.raises(RuntimeError, match="all range each other"):
-        robots_leapfrog.drive(robots_leapfrog.CASES[0], lambda place_m, scale: deaf, np.random.default_rng(1))
+        robots_strip.drive(robots_strip.CASES[0], lambda place_m, scale: deaf, np.random.default_rng(1))

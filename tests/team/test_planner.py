@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from sonofix.studies import robots_leapfrog as study
+from sonofix.studies import robots_strip as study
 from sonofix.team.leapfrog import Formation, begin
 from sonofix.team.planner import Course, Ranging, ahead, hindmost, landing, plan
 
@@ -83,12 +83,11 @@ def test_what_was_foreseen_is_found() -> None:
     for k in range(n):
         rng = np.random.default_rng([3, k])
         runs.append(study.drive(case, study.stated(RANGING, rng), rng))
-    team = formation(course=Course(np.zeros(2), 0.0, 1.0))
-    start = study.start_m(15.0, 12.5)
+    start = study.START_M
     pairs = list(combinations(study.ROBOTS, 2))
     distance = np.array([np.hypot(*(start[study.ROBOTS.index(b)] - start[study.ROBOTS.index(a)])) for a, b in pairs])
     team = begin(study.ROBOTS, start, pairs, distance, RANGING.covariance_m2(distance), 0.0).formation
-    tried = ahead(team, study.course(15.0), RANGING, study.WAY_SD, 15.0, 12.5)
+    tried = ahead(team, study.COURSE, RANGING, study.WAY_SD, 15.0, 12.5)
     assert tried is not None
     foreseen = tried[1][-1].sd_m(tried[0][-1][0])
     found = np.sqrt(np.mean([run.miss_m[-1] @ run.miss_m[-1] for run in runs]))
