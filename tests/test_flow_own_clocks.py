@@ -185,6 +185,40 @@ def test_exchanges_without_deviations_are_learnt_from(folder: Path, steps: list[
     assert np.median(sd[-6:]) < 0.3 * sd[0]
 
 
+def test_all_sound_at_once_and_codes_tell_them_apart() -> None:
+    plan = site()
+    beacons = tuple(b.model_copy(update={"offset_s": 0.0, "delay_s": 0.0}) for b in plan.beacons)
+    plan = plan.model_copy(update={"beacons": beacons})
+    motions = {name: Still((*place, 0.0)) for name, place in PLACES.items()}
+    clocks = {"R2": (0.03, 1e-5), "R1": (-0.02, -2e-5)}
+    settings = {"level": 0.5, "noise_sd": 0.02, "seed": 4}
+    recording, _ = simulate(
+        plan, motions, rate_hz=RATE_HZ, duration_s=2.0, waveforms=waveforms_of(plan), clocks=clocks, **settings
+    )
+    found = list(flow.run(recording))
+    assert all(len(step.ranges) == 6 for step in found[1:-1])
+    for step in found:
+        for a, b, r, sd in zip(
+            step.ranges.emitter,
+            step.ranges.receiver,
+            step.ranges.range_m,
+            np.sqrt(np.diag(step.ranges.covariance_m2)),
+            strict=True,
+        ):
+            assert abs(r - np.hypot(*np.subtract(PLACES[a], PLACES[b]))) < 5 * sd
+
+
+def test_epochs_in_which_nobody_is_heard_are_told_empty() -> None:
+    plan = site()
+    motions = {name: Still((*place, 0.0)) for name, place in PLACES.items()}
+    recording, _ = simulate(plan, motions, rate_hz=RATE_HZ, duration_s=1.5, waveforms={}, noise_sd=0.01)
+    found = list(flow.run(recording))
+    assert [len(step.ranges) for step in found] == [0] * len(found)
+    np.testing.assert_allclose([step.ranges.sync_s for step in found], PERIOD_S * np.arange(len(found)))
+    with pytest.raises(ValueError, match="heard by `sonofix run` alone"):
+        flow.explain(recording, 0)
+
+
 def test_a_channel_keeps_its_robots_time() -> None:
     """A clock 0.1 s ahead that runs 0.1 % fast: the same burst is told later, and drawn out."""
     plan = site()

@@ -211,10 +211,12 @@ def _run_own_clocks(
         heard, flags = peers.hear(epoch, samples, first)
         exchanges = peers.exchanges(epoch, heard)
         told = ways.epoch(epoch, [ways.take(exchange) for exchange in exchanges], flags)
+        if told is None:
+            silent = Acquisition(epoch, epoch * site.schedule.period_s, (), flags)
+            told = range_epoch(site, waveforms, silent, site.sound_speed_mps)
+        events = tuple(Event(told.sync_s, "", "samples", text) for text in flags)
+        yield replace(street.walk(told, events), exchanges=tuple(exchanges))
         epoch += 1
-        if told is not None:
-            events = tuple(Event(told.sync_s, "", "samples", text) for text in flags)
-            yield replace(street.walk(told, events), exchanges=tuple(exchanges))
         drop = min(len(samples) - 1, round(peers.begins_s(epoch) * sample_rate_hz) - first)
         if drop > 0:
             samples, first = samples[drop:], first + drop
@@ -419,6 +421,8 @@ class Receiver:
     ) -> None:
         if site.schedule is None or site.schedule.period_s is None:
             raise ValueError("reading samples needs [schedule] period_s: state how often the beacons burst")
+        if site.own_clocks:
+            raise ValueError("vehicles on clocks of their own ([schedule] own_clocks) are heard by `sonofix run` alone")
         self.site = site
         self.waveforms = waveforms
         self.sound_speed_mps = site.sound_speed_mps

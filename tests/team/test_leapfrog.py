@@ -95,6 +95,13 @@ def test_too_few_and_flat_are_told() -> None:
     assert begin(ROBOTS, START_M, PAIRS[:2], distances(START_M)[:2], NOISE[:2, :2], 0.0).status == "flat"
 
 
+def test_a_robot_that_nobody_ranges_leaves_the_start_open() -> None:
+    four = (*ROBOTS, "R3")
+    place = np.vstack([START_M, [9.0, 9.0]])
+    pairs, heard = PAIRS * 2, np.tile(distances(START_M), 2)
+    assert begin(four, place, pairs, heard, 1e-6 * np.eye(6), 0.0).status == "flat"
+
+
 def test_foreseen_is_what_a_leap_leaves() -> None:
     formation, true = begun(scale_sd=5e-4), START_M.copy()
     true[0] = [11.0, 7.0]

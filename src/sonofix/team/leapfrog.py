@@ -162,18 +162,20 @@ def begin(
     known = np.zeros((0, size))
     if scale_sd:
         known = np.eye(size)[-1:] / scale_sd
-    white = np.linalg.inv(np.linalg.cholesky(noise))
+    root_noise = np.linalg.cholesky(noise)
     none = Formation(tuple(robots), place, 0.0, np.zeros((size, size)))
     state = np.append(place.ravel(), 0.0)
     root = np.zeros((0, 0))
     for _ in range(MOST_ITERATIONS):
         shown, derivative = _expected(none, state, pairs)
-        rows, miss = [white @ derivative, known], [white @ (heard - shown), -(known @ state)]
+        rows = [np.linalg.solve(root_noise, derivative), known]
+        miss = [np.linalg.solve(root_noise, heard - shown), -(known @ state)]
         if base is not None:
             rows.append((np.concatenate([-along, along, np.zeros(size - 4)]) / base[1])[None])
             miss.append(np.array([(base[0] - along @ (state[2:4] - state[:2])) / base[1]]))
         table = np.concatenate(rows) @ free
-        if len(table) < free.shape[1] or np.linalg.cond(table / np.linalg.norm(table, axis=0)) > FLAT:
+        sizes = np.linalg.norm(table, axis=0)
+        if len(table) < free.shape[1] or not sizes.all() or np.linalg.cond(table / sizes) > FLAT:
             text = "ranges leave places open: let all range each other, and none stand on the line of two others"
             return Leap("flat", text, none, np.nan)
         orthogonal, root = np.linalg.qr(table)
@@ -181,7 +183,7 @@ def begin(
         state = state + step
         if np.abs(step).max() < SETTLED_M:
             break
-    spread = free @ np.linalg.inv(root)
+    spread = np.linalg.solve(root.T, free.T).T
     return Leap(
         "ok", "", Formation(tuple(robots), state[:-1].reshape(-1, 2), float(state[-1]), spread @ spread.T), np.nan
     )
