@@ -36,8 +36,10 @@ UNSTATED_SD_M = 0.1
 """Deviation of a hearing that states none, until `ENOUGH` of them have told theirs."""
 
 ENOUGH = 5
+"""Exchanges with neighbours on both sides, by which a pair's unstated deviations may be judged."""
+
 REMEMBERED = 40
-"""Exchanges by which a pair's unstated deviations are judged."""
+"""The latest exchanges, by which they are."""
 
 REFUSED = 36.0
 """Squared deviations beyond which an exchange says nothing of the clock; three such in a row begin it anew."""
