@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sonofix.acquire.epochs import Schedule, Window, reach_s, screen
 from sonofix.acquire.explain import Hearing, insight
+from sonofix.acquire.peers import Peers
 from sonofix.acquire.plan import acquire, make_plan
 from sonofix.acquire.roll import Roll
 from sonofix.locate.fix import fix
@@ -43,6 +44,7 @@ from sonofix.track.belief import Belief, Motion, estimate, predict
 from sonofix.track.follow import Follower, expectations
 from sonofix.track.inputs import gather
 from sonofix.track.smooth import FixedLag, smooth
+from sonofix.two_way import TwoWay, exchange_epochs, replied
 
 DEFAULT_MAX_SPEED_MPS = 3.0
 """Of a vehicle whose site file states none."""
@@ -64,17 +66,24 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
     Raises
     ------
     ValueError
-        If the recording holds neither samples nor ranges, or cannot be sampled at the site's carrier.
+        If the recording holds neither samples, ranges nor exchanges, or cannot be sampled at the site's carrier.
     """
     if recording.blocks is not None and recording.rate_hz is not None:
-        yield from _run_samples(recording, recording.rate_hz, recording.blocks, rate_hz)
-    elif recording.ranges is not None:
-        street = Street(recording.site, recording.tables.get("start"), rate_hz)
-        street.sense(recording.tables, recording.ranges.pairs)
-        for epoch in stated_epochs(recording.ranges, recording.site):
-            yield street.walk(epoch)
+        heard = _run_own_clocks if recording.site.own_clocks else _run_samples
+        yield from heard(recording, recording.rate_hz, recording.blocks, rate_hz)
+        return
+    if recording.ranges is not None:
+        epochs = iter(stated_epochs(recording.ranges, recording.site))
+    elif "exchanges" in recording.tables:
+        epochs = exchange_epochs(recording.tables["exchanges"], recording.site)
     else:
-        raise ValueError("the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv")
+        raise ValueError(
+            "the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv nor exchanges.csv"
+        )
+    street = Street(recording.site, recording.tables.get("start"), rate_hz)
+    street.sense(recording.tables, _stated_pairs(recording))
+    for epoch in epochs:
+        yield street.walk(epoch)
 
 
 def smoothed(
@@ -152,10 +161,65 @@ def _lagging(recording: Recording, steps: Iterable[Step], rate_hz: float | None,
 def _beginning(recording: Recording, time_s: float) -> Follower:
     """Return a follower of a recording as `run` begins with one at the first epoch."""
     street = Street(recording.site, recording.tables.get("start"))
-    heard = recording.blocks is not None and recording.rate_hz is not None
-    street.sense(recording.tables, None if heard or recording.ranges is None else recording.ranges.pairs)
+    street.sense(recording.tables, _stated_pairs(recording))
     street.begin(time_s)
     return street.follower
+
+
+def _stated_pairs(recording: Recording) -> tuple[tuple[str, str], ...] | None:
+    """Pairs (emitter, receiver) whose ranges others measured, with errors that they do not state; None: none are."""
+    heard = recording.blocks is not None and recording.rate_hz is not None
+    if heard:
+        return None
+    if recording.ranges is not None:
+        return recording.ranges.pairs
+    table = recording.tables["exchanges"]
+    if "heard_sd_s" in table.columns and "reply_heard_sd_s" in table.columns:
+        return None  # times of a receiver that knows how well it hears, as ours does
+    ends = dict.fromkeys(zip(table.names["from"], table.names["to"], strict=True))
+    there = [replied(recording.site, *pair) for pair in ends]
+    return tuple(pair for b, m, reply, ear in there for pair in ((b.id, m.id), (reply.id, ear.id)))
+
+
+def _run_own_clocks(
+    recording: Recording,
+    sample_rate_hz: float,
+    blocks: Callable[[int], Iterator[NDArray[np.float32]]],
+    rate_hz: float | None,
+) -> Iterator[Step]:
+    """Hear robots that each keep their own time: exchanges an epoch, ranged two-way."""
+    site = recording.site
+    if site.schedule is None or site.schedule.period_s is None:
+        raise ValueError("reading samples needs [schedule] period_s: state how often the beacons burst")
+    waveforms = waveforms_of(site, recording.references)
+    most_mps = 2.0 * max(v.max_speed_mps or DEFAULT_MAX_SPEED_MPS for v in site.vehicles)
+    plan = make_plan(waveforms, sample_rate_hz, site.sound_speed_mps, most_mps)
+    peers, ways = Peers(site, waveforms, plan, most_mps), TwoWay(site)
+    street = Street(site, recording.tables.get("start"), rate_hz)
+    street.sense(recording.tables)
+    stream = blocks(int(sample_rate_hz))
+    samples, first, epoch, ended = np.zeros((0, 0), np.float32), 0, 0, False
+    while True:
+        while not ended and (first + len(samples)) / sample_rate_hz < peers.ends_s(epoch):
+            block = next(stream, None)
+            ended = block is None
+            if block is not None:
+                samples = np.concatenate([samples, block]) if samples.size else block
+        end_s = (first + len(samples)) / sample_rate_hz
+        if ended and epoch * site.schedule.period_s + min(b.offset_s for b in site.coded_beacons) > end_s:
+            return
+        heard, flags = peers.hear(epoch, samples, first)
+        exchanges = peers.exchanges(epoch, heard)
+        told = ways.epoch(epoch, [ways.take(exchange) for exchange in exchanges], flags)
+        if told is None:
+            silent = Acquisition(epoch, epoch * site.schedule.period_s, (), flags)
+            told = range_epoch(site, waveforms, silent, site.sound_speed_mps)
+        events = tuple(Event(told.sync_s, "", "samples", text) for text in flags)
+        yield replace(street.walk(told, events), exchanges=tuple(exchanges))
+        epoch += 1
+        drop = min(len(samples) - 1, round(peers.begins_s(epoch) * sample_rate_hz) - first)
+        if drop > 0:
+            samples, first = samples[drop:], first + drop
 
 
 def _run_samples(
@@ -357,6 +421,8 @@ class Receiver:
     ) -> None:
         if site.schedule is None or site.schedule.period_s is None:
             raise ValueError("reading samples needs [schedule] period_s: state how often the beacons burst")
+        if site.own_clocks:
+            raise ValueError("vehicles on clocks of their own ([schedule] own_clocks) are heard by `sonofix run` alone")
         self.site = site
         self.waveforms = waveforms
         self.sound_speed_mps = site.sound_speed_mps

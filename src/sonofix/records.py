@@ -199,6 +199,39 @@ class Acquisition:
     flags: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """Two robots that heard each other: a burst, and the other's own, each robot's times on its own clock.
+
+    Which of both bursts came first does not matter, nor how long one waited for the other.
+
+    Attributes
+    ----------
+    emitter, receiver : str
+        Beacon of the first burst, and the microphone that heard it, on the other robot.
+    sent_s, reply_heard_s : float
+        On the first robot's clock: when the middle of its burst left, and the other's was heard.
+    heard_s, reply_sent_s : float
+        On the other's.
+    heard_sd_s, reply_heard_sd_s : float or None
+        Deviations of what was heard; None: not stated.
+    time_scales : (float, float), (float, float) or None
+        Of both bursts, as in `Detection`, each with its deviation; None where nobody measured them.
+    snr_db : (float, float) or None
+    """
+
+    emitter: str
+    receiver: str
+    sent_s: float
+    heard_s: float
+    reply_sent_s: float
+    reply_heard_s: float
+    heard_sd_s: float | None = None
+    reply_heard_sd_s: float | None = None
+    time_scales: tuple[tuple[float, float], tuple[float, float]] | None = None
+    snr_db: tuple[float, float] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeEpoch:
     """Ranges of one epoch, a row an emitter–receiver pair.
@@ -364,7 +397,10 @@ class Event:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What one epoch brought: the row of the street from ranges to estimates."""
+    """What one epoch brought: the row of the street from ranges to estimates.
+
+    ``exchanges``: what robots on clocks of their own heard of each other, where ranges come from that.
+    """
 
     ranges: RangeEpoch
     fixes: tuple[Fix, ...]
@@ -372,6 +408,7 @@ class Step:
     events: tuple[Event, ...]
     range_used: NDArray[np.bool_]
     range_clock_offset_m: Floats
+    exchanges: tuple[Exchange, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -109,11 +109,19 @@ class AirSection(_Section):
 class Schedule(_Section):
     """`[schedule]`: epochs every `period_s` where no sync file says otherwise.
 
-    With `synchronised`, bursts start at sync + offset_s; without, the recorder's clock has one unknown offset.
+    With `synchronised`, bursts start at sync + offset_s; without, the recorder's clock has one unknown offset. With
+    `own_clocks`, each vehicle sounds and records on a clock of its own, and robots range each other two-way.
     """
 
     period_s: Positive | None = None
     synchronised: Annotated[bool, Field(strict=True)] = True
+    own_clocks: Annotated[bool, Field(strict=True)] = False
+
+    @classmethod
+    def _broken_rules(cls, get: Callable[[str], Any]) -> Iterator[Mistake]:
+        if get("own_clocks") is True and get("synchronised") is not False:
+            remedy = "clocks of their own are not in sync: add synchronised = false, or leave own_clocks out"
+            yield ("own_clocks",), True, remedy
 
 
 class Signal(_Section):
@@ -379,6 +387,12 @@ class Site(_Section):
                     yield (kind, i, "vehicle"), vehicle, remedy
         yield from _pair_rules(_rows(get("pair"), get("pairs")), kinds["beacon"], kinds["microphone"])
         yield from _code_rules(kinds["beacon"], get("schedule"), get("signal"))
+        if _reader(get("schedule"))("own_clocks") is True:
+            for kind in ("beacon", "microphone"):
+                for i, row in enumerate(kinds[kind]):
+                    if row("vehicle") is None:
+                        remedy = "with own_clocks all is timed by vehicles' clocks; mount it on one, which may stand"
+                        yield (kind, i, "vehicle"), None, remedy
 
     @property
     def name(self) -> str:
@@ -407,16 +421,23 @@ class Site(_Section):
     def clock_known(self) -> bool:
         """Whether the moments of sending are known on the recorder's clock, so that ranges are not just differences.
 
-        They are not where bursts start at no sync command, nor where a recorded reference states no distance.
+        They are not where bursts start at no sync command, nor where a recorded reference states no distance. Two-way
+        ranges know both ends' clocks.
         """
         unplaced = any(isinstance(b.code, ReferenceCode) and b.code.distance_m is None for b in self.beacons)
-        return not unplaced and (self.schedule is None or self.schedule.synchronised)
+        return not unplaced and (self.schedule is None or self.schedule.synchronised or self.own_clocks)
 
     @property
     def free_running(self) -> bool:
         """Whether every burst has an offset of its own: beacons that only ride on vehicles, on their own clocks."""
         unsynchronised = self.schedule is not None and not self.schedule.synchronised
-        return unsynchronised and all(b.vehicle is not None for b in self.coded_beacons or self.beacons)
+        riding = all(b.vehicle is not None for b in self.coded_beacons or self.beacons)
+        return unsynchronised and not self.own_clocks and riding
+
+    @property
+    def own_clocks(self) -> bool:
+        """Whether each vehicle sounds and records on a clock of its own, so that ranges are two-way."""
+        return self.schedule is not None and self.schedule.own_clocks
 
     @property
     def coded_beacons(self) -> tuple[Beacon, ...]:

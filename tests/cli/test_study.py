@@ -52,7 +52,10 @@ def test_a_part_is_chosen_and_one_that_is_none_is_told(tmp_path: Path) -> None:
     assert (content["study"], content["part"]) == ("robots", "collision")
     told = CliRunner().invoke(app, ["study", "robots", "--part", "leap"])
     assert told.exit_code == 2
-    assert told.stderr.strip() == "study robots, part leap: there is none of that name; choose of detection, collision"
+    assert (
+        told.stderr.strip()
+        == "study robots, part leap: there is none of that name; choose of detection, collision, leapfrog"
+    )
 
 
 def test_same_seed_same_numbers_and_no_picture_where_none_is_wanted(tmp_path: Path) -> None:

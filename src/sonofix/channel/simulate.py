@@ -51,6 +51,12 @@ class _Scene:
     tone: Tone | None
     clip: float | None
     seed: int
+    clocks: Mapping[str, tuple[float, float]]
+
+    def heard_by(self, microphone: Microphone) -> tuple[float, float]:
+        """Samples a second of true time, and how much later than sound reaches it a sample is told, in true time."""
+        offset_s, drift = self.clocks.get(microphone.vehicle or "", (0.0, 0.0))
+        return self.rate_hz * (1.0 + drift), microphone.delay_s + offset_s / (1.0 + drift)
 
 
 def absorption_of(site: Site, carrier_hz: float) -> float:
@@ -77,6 +83,7 @@ def simulate(
     clock_drift: float = 0.0,
     beacon_drift: Mapping[str, float] | None = None,
     sync_jitter_s: float = 0.0,
+    clocks: Mapping[str, tuple[float, float]] | None = None,
     seed: int = 0,
 ) -> tuple[Recording, dict[str, Truth]]:
     """Make a recording of a site whose vehicles move as told, and the truth about it.
@@ -112,6 +119,10 @@ def simulate(
         of the chips' and the carrier's length always.
     sync_jitter_s : float
         Standard deviation of sync commands about the regular grid; ``sync_s`` tells when they came.
+    clocks : mapping from vehicle id to (offset_s, drift), optional
+        Of a site with ``own_clocks``: what each vehicle's clock shows at time 0, and by what share it runs fast. It
+        times what the vehicle sounds and the samples of its channels. Vehicles not named, the first among them, keep
+        the time that motions and truth are told in.
     seed : int
         Same seed, same samples, however they are read.
 
@@ -153,14 +164,19 @@ def simulate(
     schedule = site.schedule
     if schedule is None or schedule.period_s is None:
         raise ValueError("schedule.period_s is missing: when do beacons burst? Add [schedule] with period_s")
+    clocks = dict(clocks or {})
+    _check_clocks(site, clocks, clock_offset_s, clock_drift)
+    own = {b.id: clocks[b.vehicle] for b in site.beacons if b.vehicle in clocks}
+    slow = {b: 1.0 / (1.0 + drift) - 1.0 for b, (_, drift) in own.items()}
     timing = timing_of(
         schedule.period_s,
         schedule.synchronised,
         duration_s,
         offset_s=clock_offset_s,
         drift=clock_drift,
-        beacon_drift=beacon_drift,
+        beacon_drift={b: slow.get(b, 0.0) + (beacon_drift or {}).get(b, 0.0) for b in (*slow, *(beacon_drift or {}))},
         jitter_s=sync_jitter_s,
+        beacon_offset_s={b: -offset / (1.0 + drift) for b, (offset, drift) in own.items()},
         seed=seed,
     )
     scene = _Scene(
@@ -181,6 +197,7 @@ def simulate(
         tone=tone,
         clip=clip,
         seed=seed,
+        clocks=clocks,
     )
     count = max(round(duration_s * rate_hz), 1)
     irregular = schedule.synchronised and bool(clock_offset_s or clock_drift or sync_jitter_s)
@@ -192,6 +209,25 @@ def simulate(
         sync_s=timing.sync_s if irregular else None,
     )
     return recording, {v.id: truth_of(v.id, motions[v.id], duration_s) for v in site.vehicles}
+
+
+def _check_clocks(
+    site: Site, clocks: Mapping[str, tuple[float, float]], clock_offset_s: float, clock_drift: float
+) -> None:
+    if not clocks:
+        return
+    if not site.own_clocks:
+        raise ValueError("clocks: the site's vehicles share one; add own_clocks = true to [schedule] or leave them out")
+    if clock_offset_s or clock_drift:
+        raise ValueError("clock_offset_s, clock_drift: no common clock is there to be off; leave them out with clocks")
+    known = [v.id for v in site.vehicles]
+    for vehicle, (offset_s, drift) in clocks.items():
+        if vehicle not in known:
+            raise ValueError(f"clocks: {vehicle} is not in the site; it has {', '.join(known)}")
+        if not (abs(offset_s) <= 1e6 and abs(drift) <= 0.01):
+            raise ValueError(f"clocks of {vehicle}: {offset_s:g} s, {drift:g}; at most 1e6 s and a hundredth")
+    if any(clocks.get(known[0], (0.0, 0.0))):
+        raise ValueError(f"clocks: {known[0]}, the first vehicle, keeps the time; tell the others' clocks against it")
 
 
 def _check(
@@ -263,8 +299,9 @@ def _page(scene: _Scene, page: int) -> NDArray[np.float32]:
 def _hear(scene: _Scene, out: Floats, first: int, microphone: Microphone, beacon: Beacon) -> None:
     """Add one beacon's sound, direct and by way of the walls, to one page of one channel."""
     waveform, speed = scene.waveforms[beacon.id], scene.sound_speed_mps
-    from_s = first / scene.rate_hz - microphone.delay_s
-    to_s = (first + PAGE - 1) / scene.rate_hz - microphone.delay_s
+    rate_hz, delay_s = scene.heard_by(microphone)
+    from_s = first / rate_hz - delay_s
+    to_s = (first + PAGE - 1) / rate_hz - delay_s
     heard = pose_table(microphone, scene.motions, from_s, to_s, speed)
     # emitters are slower than c / 3: travel takes at most 1.5 times what the distance when it is heard would
     edge = np.linspace(from_s, to_s, 9)
@@ -288,7 +325,7 @@ def _hear(scene: _Scene, out: Floats, first: int, microphone: Microphone, beacon
         add_sound(
             out,
             first,
-            scene.rate_hz,
+            rate_hz,
             heard,
             emitter,
             waveform,
@@ -297,5 +334,5 @@ def _hear(scene: _Scene, out: Floats, first: int, microphone: Microphone, beacon
             gain=scene.gain[beacon.id] * reflection,
             absorption_db_per_m=scene.absorption_db_per_m[beacon.id],
             stretch=stretch,
-            microphone_delay_s=microphone.delay_s,
+            microphone_delay_s=delay_s,
         )

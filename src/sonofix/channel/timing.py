@@ -30,6 +30,8 @@ class Timing:
         Of the beacons' common clock; a drift of 1e-6 makes its second a millionth longer than the recorder's.
     beacon_drift : mapping from beacon id to float
         What one beacon's clock adds to the drift.
+    beacon_offset_s : mapping from beacon id to float
+        By how much later than the common clock says one that runs on its own begins.
     first : int
     sync_s : float64 (epochs,)
         The sync commands from the recording's start to its end.
@@ -42,6 +44,7 @@ class Timing:
     beacon_drift: Mapping[str, float] = field(default_factory=dict)
     first: int = 0
     sync_s: Floats = field(default_factory=lambda: np.zeros(0))
+    beacon_offset_s: Mapping[str, float] = field(default_factory=dict)
 
     def stretch(self, beacon: Beacon) -> float:
         """Return the recorder's seconds for each second of the beacon's clock."""
@@ -50,12 +53,13 @@ class Timing:
     def starts_s(self, beacon: Beacon, from_s: float, to_s: float) -> Floats:
         """When bursts leave a beacon, at least all between two times, in order, (k,)."""
         stretch = self.stretch(beacon)
-        slack = 2.0 * self.period_s + abs(beacon.offset_s) + abs(beacon.delay_s)
+        late_s = self.beacon_offset_s.get(beacon.id, 0.0)
+        slack = 2.0 * self.period_s + abs(beacon.offset_s) + abs(beacon.delay_s) + abs(late_s)
         low = int(np.floor((from_s - self.offset_s - slack) / (self.period_s * stretch)))
         high = int(np.ceil((to_s - self.offset_s + slack) / (self.period_s * stretch)))
         k = np.arange(low, high + 1).astype(np.float64)
         if not self.synchronised:
-            return self.offset_s + (k * self.period_s + beacon.offset_s) * stretch + beacon.delay_s
+            return self.offset_s + late_s + (k * self.period_s + beacon.offset_s) * stretch + beacon.delay_s
         sync = self.offset_s + k * self.period_s * (1.0 + self.drift)
         listed = (k >= self.first) & (k < self.first + len(self.sync_s))
         sync[listed] = self.sync_s[k[listed].astype(int) - self.first]
@@ -71,6 +75,7 @@ def timing_of(
     drift: float = 0.0,
     beacon_drift: Mapping[str, float] | None = None,
     jitter_s: float = 0.0,
+    beacon_offset_s: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> Timing:
     """Lay out the sync commands of one recording.
@@ -97,4 +102,5 @@ def timing_of(
     if jitter_s:
         noise = np.random.default_rng([seed, 1]).standard_normal(len(k))
         sync = sync + jitter_s * np.clip(noise, -3.0, 3.0)
-    return Timing(period_s, synchronised, offset_s, drift, dict(beacon_drift or {}), first, sync)
+    late = dict(beacon_offset_s or {})
+    return Timing(period_s, synchronised, offset_s, drift, dict(beacon_drift or {}), first, sync, late)

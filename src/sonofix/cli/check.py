@@ -83,6 +83,7 @@ def _site_lines(recording: Recording) -> Iterator[str]:
     if site.schedule:
         every = f"every {site.schedule.period_s:g} s, " if site.schedule.period_s else ""
         clock = "synchronised" if site.schedule.synchronised else "recorder's clock offset unknown"
+        clock = "each vehicle on a clock of its own" if site.own_clocks else clock
         yield f"Schedule: {every}{clock}"
 
 
@@ -179,7 +180,7 @@ def _measurement_lines(recording: Recording, figures: CaptureFigures | None) -> 
             f"{_plural(len(np.unique(rows.time_s)), 'instant')} in "
             f"{np.ptp(rows.time_s):.1f} s, {rows.range_m.min():.2f} to {rows.range_m.max():.2f} m"
         )
-    if figures is None and recording.ranges is None:
+    if figures is None and recording.ranges is None and "exchanges" not in recording.tables:
         yield "No samples and no ranges: nothing to compute positions from."
 
 

@@ -65,6 +65,14 @@ def simulate(
     clock_ppm: Annotated[
         float, typer.Option(help="How much longer the beacons' second is than the recorder's, millionths.")
     ] = 0.0,
+    clock: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where vehicles have clocks of their own, VEHICLE:OFFSET,PPM: what it shows at time 0 (s), and by how "
+            "many millionths it runs fast; repeat it. The first vehicle's clock is right.",
+            show_default="drawn: a quarter of a period and 20 ppm at most",
+        ),
+    ] = None,
     sync_jitter: Annotated[
         float, typer.Option(help="Standard deviation in s of sync commands; sync.csv tells when they came.")
     ] = 0.0,
@@ -77,6 +85,10 @@ def simulate(
     Sound is followed sample by sample from moving emitters to moving microphones. For example, a lap of a hall:
 
     sonofix simulate hall.toml lap --motion "waypoints:1,1;9,1;9,7;1,7;1,1@1.2" --snr 6
+
+    Robots with clocks of their own ([schedule] own_clocks), of which one drives:
+
+    sonofix simulate team.toml out --vehicle A --motion still:0,0 --vehicle B --motion line:5,0,0.3,0 --clock B:0.1,15
     """
     from sonofix import files
 
@@ -100,6 +112,7 @@ def simulate(
         absorption=absorption,
         tone=None if tone_hz is None else (tone_hz, 10 ** (tone_db / 20)),
         clock=(clock_offset, 1e-6 * clock_ppm, sync_jitter),
+        clocks=_clocks(plan, clock or [], seed),
         seed=seed,
     )
     _write(out, recording, truth, references, flac, force)
@@ -184,6 +197,30 @@ def parse_motion(text: str, z_m: float, site: Site, vehicle: str) -> Motion:
     )
 
 
+def _clocks(site: Site, told: list[str], seed: int) -> dict[str, tuple[float, float]]:
+    """Clocks as told, or drawn where a site has them and none is told."""
+    import numpy as np
+
+    if not told:
+        if not site.own_clocks or site.schedule is None:
+            return {}
+        rng, quarter_s = np.random.default_rng([seed, 4]), (site.schedule.period_s or 0.0) / 4
+        others = [v.id for v in site.vehicles[1:]]
+        drawn = rng.uniform(-1.0, 1.0, (len(others), 2)) * [quarter_s, 20e-6]
+        return {name: (float(offset_s), float(drift)) for name, (offset_s, drift) in zip(others, drawn, strict=True)}
+    clocks: dict[str, tuple[float, float]] = {}
+    for text in told:
+        name, _, rest = text.rpartition(":")
+        try:
+            offset_s, ppm = _numbers(rest, 2, 2)
+        except ValueError as error:
+            raise ValueError(f"--clock {text}: {error}; write VEHICLE:OFFSET,PPM") from None
+        if name in clocks:
+            raise ValueError(f"--clock {name}: is given twice; a vehicle has one clock")
+        clocks[name] = (offset_s, 1e-6 * ppm)
+    return clocks
+
+
 def _numbers(text: str, least: int, most: int, last: float = 0.0) -> list[float]:
     """Numbers parted by commas; where one fewer than ``most`` came, ``last`` is added."""
     parts = text.split(",")
@@ -245,6 +282,7 @@ def _made(
     absorption: float | None,
     tone: tuple[float, float] | None,
     clock: tuple[float, float, float],
+    clocks: Mapping[str, tuple[float, float]],
     seed: int,
 ) -> tuple[Recording, dict[str, Truth]]:
     from sonofix import channel
@@ -274,6 +312,7 @@ def _made(
         clock_offset_s=offset_s,
         clock_drift=drift,
         sync_jitter_s=jitter_s,
+        clocks=clocks,
         seed=seed,
     )
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def study(
     name: Annotated[str, typer.Argument(help="quasi-gps, pedestrian or robots.")],
     part: Annotated[
-        str | None, typer.Option(help="Of robots: detection (the default) or collision.", show_default=False)
+        str | None, typer.Option(help="Of robots: detection (the default), collision or leapfrog.", show_default=False)
     ] = None,
     runs: Annotated[int, typer.Option(help="Runs on the paper's numbers.", min=1, max=100_000)] = 300,
     waveforms: Annotated[
@@ -34,7 +34,8 @@ def study(
     \b
     quasi-gps   a vehicle's coarse fixes and velocities, and the paper's four-state filter
     pedestrian  a walker's fixes by arrival-time differences, steps, and the paper's error-state filter
-    robots      three robots: a burst picked out of noise (--part detection), a collision repaired (--part collision)
+    robots      three robots: a burst picked out of noise (--part detection), a collision repaired (--part collision),
+                100 m by leap-frog (--part leapfrog)
 
     Each figure comes with its standard error over the runs. Ctrl-C keeps the runs that are finished. For example:
 

@@ -15,6 +15,7 @@ from sonofix.files.site_file import FILE_NAME, read_site
 from sonofix.files.tables import LAYOUTS, read_table
 from sonofix.records import Floats, RangeRows, Recording, ReferenceBurst, Table, Truth
 from sonofix.site import ChirpCode, ReferenceCode, Site
+from sonofix.two_way import replied
 
 SENSOR_FILES = ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings", "exchanges")
 LONGEST_REFERENCE_S = 10.0
@@ -70,8 +71,10 @@ def read_recording(folder: str | Path, *, to_run: bool = False) -> Recording:
             site = _with_period(site, tables.get("sync"))
             problems += _capture_problems(site, capture, "ranges" in tables)
         references = attempt(lambda: read_references(folder, site)) or {}
-        if to_run and not problems and capture is None and ranges is None:
-            remedy = "nothing to compute positions from; add capture.wav, capture.flac or ranges.csv"
+        if "exchanges" in tables:
+            problems += _exchange_problems(tables["exchanges"], site)
+        if to_run and not problems and capture is None and ranges is None and "exchanges" not in tables:
+            remedy = "nothing to compute positions from; add capture.wav, capture.flac, ranges.csv or exchanges.csv"
             problems.append(Problem(str(folder), "", None, remedy))
     if problems or site is None:
         raise RecordingError(problems)
@@ -182,6 +185,17 @@ def _range_rows(table: Table, site: Site) -> RangeRows:
             remedy = f"{len(below)} rows are below 0, which only an unknown clock could explain (synchronised = false)"
             raise RecordingError([Problem("ranges.csv", column, value, remedy)])
     return RangeRows(columns["time_s"], table.names["from"], table.names["to"], range_m, columns.get("sd_m"), speed_sd)
+
+
+def _exchange_problems(table: Table, site: Site) -> list[Problem]:
+    """Tell ends that cannot exchange, once each."""
+    problems = []
+    for ends in dict.fromkeys(zip(table.names["from"], table.names["to"], strict=True)):
+        try:
+            replied(site, *ends)
+        except ValueError as error:
+            problems.append(Problem("exchanges.csv", "from, to", ", ".join(ends), str(error)))
+    return problems
 
 
 def _with_period(site: Site, sync: Table | None) -> Site:

@@ -64,9 +64,11 @@ LAYOUTS = {
     "bearings": Layout(("time_s", "from", "to", "bearing_rad"), given=("time_s", "bearing_rad"), key="to"),
     "exchanges": Layout(
         ("from", "to", "sent_s", "heard_s", "reply_sent_s", "reply_heard_s"),
+        ("heard_sd_s", "reply_heard_sd_s"),
         given=("sent_s", "heard_s", "reply_sent_s", "reply_heard_s"),
         order="sent_s",
         key="from",
+        bounds={"heard_sd_s": (1e-12, np.inf, "s"), "reply_heard_sd_s": (1e-12, np.inf, "s")},
     ),
     "odometry": Layout(("time_s", "v_mps", "yaw_rate_radps"), per_vehicle=True, key="vehicle"),
     "steps": Layout(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sonofix.attitude import quaternion
 from sonofix.files.problem import Problem, RecordingError
 from sonofix.files.results import plain_name
-from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step
+from sonofix.records import Estimate, Event, Exchange, Fix, RangeEpoch, Step
 from sonofix.site import Site
 
 COLUMNS = {
@@ -27,6 +27,12 @@ COLUMNS = {
     "track.csv": "time_s,vehicle,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,yaw_rad,sd_x_m,sd_y_m,sd_z_m,sd_yaw_rad,source",
     "events.csv": "time_s,vehicle,event,detail",
 }
+
+EXCHANGE_COLUMNS = (
+    *("from", "to", "sent_s", "heard_s", "reply_sent_s", "reply_heard_s"),
+    *("heard_sd_s", "reply_heard_sd_s"),
+)
+"""What exchanges.csv has, which only sites with clocks of their own come with."""
 
 TILT_COLUMNS = "roll_rad,pitch_rad,sd_roll_rad,sd_pitch_rad"
 """What fixes.csv and track.csv have behind these where a vehicle of the site tilts."""
@@ -116,6 +122,8 @@ class RunWriter:
         try:
             for name in COLUMNS:
                 self._files[name] = _RowFile(self.out / name, _header(name, self._tilts), ",")
+            if self._site.own_clocks:
+                self._files["exchanges.csv"] = _RowFile(self.out / "exchanges.csv", [*EXCHANGE_COLUMNS], ",")
             for vehicle in self._site.vehicles:
                 self._files[f"tum {vehicle.id}"] = _RowFile(self.out / _tum_name(self._site, vehicle.id), None, " ")
         except BaseException:
@@ -151,6 +159,8 @@ class RunWriter:
         self._files["track.csv"].add(
             (estimate.time_s, _track_row(estimate, self._tilts)) for estimate in step.estimates
         )
+        if step.exchanges and "exchanges.csv" in self._files:
+            self._files["exchanges.csv"].add((sync_s, _exchange_row(exchange)) for exchange in step.exchanges)
         self._files["events.csv"].add((event.time_s, _event_row(event)) for event in step.events)
         for estimate in step.estimates:
             key = f"tum {estimate.vehicle}"
@@ -340,6 +350,12 @@ def _range_rows(step: Step) -> Iterator[tuple[float, list[str]]]:
                 str(int(step.range_used[i])),
             ],
         )
+
+
+def _exchange_row(exchange: Exchange) -> list[str]:
+    e = exchange
+    stamps = (e.sent_s, e.heard_s, e.reply_sent_s, e.reply_heard_s)
+    return [e.emitter, e.receiver, *map(_time, stamps), *map(_figure, (e.heard_sd_s, e.reply_heard_sd_s))]
 
 
 def _tum_row(estimate: Estimate) -> list[str]:

@@ -10,11 +10,11 @@ from sonofix.studies.work import Work
 STUDIES = {
     "quasi-gps": "an automatic vehicle: coarse fixes and velocities, and the four-state filter",
     "pedestrian": "a walker: differences of arrival times, dead reckoning by steps, and the error-state filter",
-    "robots": "three robots: bursts picked out of noise by adaptive filters, and a collision repaired by fellows",
+    "robots": "three robots: bursts picked out of noise by adaptive filters, a collision repaired, leap-frog",
 }
 """Names of the studies and what they are about. Each has a module of its name with a `study` of its own."""
 
-PARTS = {"robots": ("detection", "collision")}
+PARTS = {"robots": ("detection", "collision", "leapfrog")}
 """Studies of several parts, of which one is done at a time."""
 
 
