@@ -1,0 +1,1 @@
+"""Several robots that place each other: peer ranges and bearings, odometry, landmarks → joint estimates and roles."""
