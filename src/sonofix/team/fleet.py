@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,8 +36,13 @@ JUDGED = 6
 SLIPPED = (1.0, 1.0, 0.5)
 """How far aside a robot may be found that was pushed, in m and rad."""
 
-LOST_S = 3.0
-"""A robot that is refused again so soon after that is placed anew."""
+ITERATED = 8
+
+EXPLAINED = 0.7
+"""Share of what was heard since that a slip must explain."""
+
+REWOUND_S = 2.0
+"""A slip is looked for so far back."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,14 +151,19 @@ class Belief:
             from_s, until_s, psd, self.by, self.drive_noise, self.speed,
         )  # fmt: skip
 
-    def hear(self, feed: Feed, rows: tuple[int, int]) -> tuple[NDArray[np.bool_], Floats]:
-        """Take measurements in; return which ranges and bearings were, and what `hear.hear` tells of them."""
+    def hear(
+        self, feed: Feed, rows: tuple[int, int], about: Floats | None = None
+    ) -> tuple[NDArray[np.bool_], Floats]:
+        """Take measurements in; return which ranges and bearings were, and what `hear.hear` tells of them.
+
+        They are linearised ``about`` some state, or else at the mean as it moves.
+        """
         count = rows[1] - rows[0]
         used = np.zeros((count, 2), bool)
         found = np.full((count, 2, 4), np.nan)
         told = self.noise
         hear(
-            self.mean, self.covariance, self.mean, self.placed, rows, feed.time_s, feed.kind, feed.listener, feed.source,
+            self.mean, self.covariance, self.mean if about is None else about, self.placed, rows, feed.time_s, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.pair,
             told.ranges, told.bearings, told.share, told.last_s, told.believed, 1.0 / feed.sound_speed_mps, self.speed,
             used, found, np.empty((3, len(self.mean))),
@@ -207,7 +217,6 @@ class Watch:
 
     def __init__(self, robots: int) -> None:
         self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
-        self.slipped_s = np.full(robots, -np.inf)
 
     def clear(self, robot: int) -> None:
         """Forget what was refused."""
@@ -254,6 +263,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     watch, recent = Watch(len(feed.robots)), Recent(feed)
     for robot, start in feed.starts.items():
         belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
+    past: deque[_Before] = deque()
     now: float | None = None
     asked_s = left_s = -np.inf
     for time_s, first, last in instants(feed):
@@ -268,11 +278,14 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         count = last - first
         used, told = np.zeros((count, 2), bool), np.full((count, 2, 4), np.nan)
         if count and not until_placed:
+            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy()))
+            while time_s - past[0].time_s > REWOUND_S:
+                past.popleft()
             used, told = belief.hear(feed, rows)
             watch.see(feed, rows, used, told)
             found = watch.astray()
             if found is not None:
-                _reopen(belief, feed, found, watch, recent, time_s, events)
+                _reopen(belief, feed, found, watch, recent, past, events)
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
@@ -303,28 +316,61 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
             events.append(Event(time_s, feed.robots[robot], "joined", text))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Before:
+    """A belief as it was before what was heard at an instant."""
+
+    time_s: float
+    rows: tuple[int, int]
+    mean: Floats
+    covariance: Floats
+
+
 def _reopen(
     belief: Belief,
     feed: Feed,
     found: tuple[int, list[int]],
     watch: Watch,
     recent: Recent,
-    time_s: float,
+    past: Sequence[_Before],
     events: list[Event],
 ) -> None:
-    """Find a robot that is not where its track has it, round there, by rows that were refused; else take its place away."""
+    """Find a robot that is not where its track has it: open its place where that began, and hear anew what came since.
+
+    Far from where it was, a first linearisation is a poor one, so it is done about what it led to, again and again (Bell
+    and Cathey 1993). Where that explains too little, the robot's place is taken away.
+    """
     robot, rows = found
     watch.clear(robot)
-    kept = belief.mean.copy(), belief.covariance.copy()
-    belief.loosen(robot, SLIPPED)
-    used = [bool(belief.hear(feed, (i, i + 1))[0].any()) for i in rows]
-    apart = float(np.hypot(*(belief.mean[belief.at(robot)] - kept[0][belief.at(robot)])[:2]))
-    if all(used) and time_s - watch.slipped_s[robot] > LOST_S:
-        watch.slipped_s[robot] = time_s
+    kept, now_s = (belief.mean.copy(), belief.covariance.copy()), past[-1].time_s
+    since = [before for before in past if before.rows[1] > rows[0]]
+    at, shift, taken = belief.at(robot), np.zeros(POSE), 0.0
+    for _ in range(ITERATED):
+        belief.mean[:], belief.covariance[:] = since[0].mean, since[0].covariance
+        belief.loosen(robot, SLIPPED)
+        track = belief.mean.copy()
+        used: list[bool] = []
+        for i, step in enumerate(since):
+            if i:
+                last_s = since[i - 1].time_s
+                own, shared = belief.mean.copy(), belief.covariance.copy()
+                belief.mean[:] = track
+                belief.drive(feed, last_s, step.time_s)
+                track = belief.mean.copy()
+                belief.mean[:], belief.covariance[:] = own, shared
+                belief.drive(feed, last_s, step.time_s)
+            about = belief.mean.copy()
+            about[at] = track[at] + shift
+            heard, _ = belief.hear(feed, step.rows, about)
+            own_rows = [k for k, row in enumerate(range(*step.rows)) if robot in (feed.listener[row], feed.source[row])]
+            used += [bool(heard[k].any()) for k in own_rows]
+        shift, taken = belief.mean[at] - track[at], float(np.mean(used))
+    apart = float(np.hypot(*(belief.mean[at] - kept[0][at])[:2]))
+    if taken >= EXPLAINED:
         text = f"what is heard disagrees with its odometry: {apart:.2f} m from where that had it"
-        events.append(Event(time_s, feed.robots[robot], "slip", text))
+        events.append(Event(now_s, feed.robots[robot], "slip", text))
         return
     belief.mean[:], belief.covariance[:] = kept
     belief.lift(robot)
     recent.forget(robot)
-    events.append(Event(time_s, feed.robots[robot], "lost", "what is heard disagrees with its track: to be placed anew"))
+    events.append(Event(now_s, feed.robots[robot], "lost", "what is heard disagrees with its track: to be placed anew"))
