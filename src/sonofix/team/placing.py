@@ -6,7 +6,7 @@ directions are tried, each is bettered by robust Gauss–Newton steps, and the b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,8 @@ class Clues:
     range_m: Floats
     bearing_rad: Floats
     compass: NDArray[np.bool_]
+    doubt: Floats | None = None
+    """What odometry may have erred since each row, (m, 2), in m and rad; `place` fills it in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +89,7 @@ def place(clues: Clues, now: Floats) -> Placed | None:
     if told < 4:
         return None
     best: list[tuple[float, Floats]] = []
+    clues = replace(clues, doubt=_doubt(clues, now))
     for start in _starts(clues):
         found = _settle(clues, start)
         best.append((float(np.sum(np.minimum(_residuals(clues, found)[0] ** 2, LIMIT**2))), found))
@@ -105,20 +108,22 @@ def place(clues: Clues, now: Floats) -> Placed | None:
         apart[2] -= 2 * np.pi * np.round(apart[2] / (2 * np.pi))
         if other_cost - cost < RIVALS and np.any(np.abs(apart) > [0.5, 0.5, 0.5]):
             return None
-    # errors of odometry over the clues' span, to the frame's three numbers
-    way = np.ptp(clues.own[:, :2], axis=0)
-    turned = float(np.ptp(clues.own[:, 2]))
-    loose = np.diag([*(2 * ((WAY_SD * np.hypot(*way)) ** 2,)), (TURN_SD * turned) ** 2])
     cos, sin = np.cos(found[2]), np.sin(found[2])
     turn = np.eye(3)
     turn[:2, 2] = [-sin * now[0] - cos * now[1], cos * now[0] - sin * now[1]]
-    spread = turn @ covariance @ turn.T + loose
+    spread = turn @ covariance @ turn.T
     if np.sqrt(max(spread[0, 0], spread[1, 1])) > PLACED_SD[0] or np.sqrt(spread[2, 2]) > PLACED_SD[1]:
         return None
     gain = -turn @ covariance @ by[kept].T
     whose = np.concatenate([clues.anchor, clues.anchor])[_told(clues)][kept]
     moved = {who: gain @ (by_other[kept] * (whose == who)[:, None]) for who in np.unique(whose[whose >= 0]).tolist()}
     return Placed(_at(found, now), spread, moved)
+
+
+def _doubt(clues: Clues, now: Floats) -> Floats:
+    way = np.hypot(*(clues.own[:, :2] - now[:2]).T)
+    turned = np.abs(clues.own[:, 2] - now[2])
+    return np.column_stack([WAY_SD * way + TURN_SD * turned * way / 2, TURN_SD * turned])
 
 
 def _told(clues: Clues) -> NDArray[np.bool_]:
@@ -178,7 +183,8 @@ def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
     flat = np.maximum(dx**2 + dy**2, 1e-6)
     r = np.sqrt(flat + clues.arm[:, 2] ** 2)
     m = len(r)
-    range_sd = np.hypot(BEGIN_SD_M, SCALE_SD * np.nan_to_num(clues.range_m))
+    doubt = np.zeros((m, 2)) if clues.doubt is None else clues.doubt
+    range_sd = np.sqrt(BEGIN_SD_M**2 + (SCALE_SD * np.nan_to_num(clues.range_m)) ** 2 + doubt[:, 0] ** 2)
     by_place = np.column_stack([-dx / r, -dy / r])  # of r, by the robot's place
     range_by = np.column_stack([by_place, -by_place[:, 0] * from_y + by_place[:, 1] * from_x])
     range_other = np.column_stack([-by_place, np.zeros(m)])
@@ -196,7 +202,7 @@ def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
         bearing_by[c] = [0.0, 0.0, 1.0]
         bearing_other[c] = 0.0
     off = off - 2 * np.pi * np.round(off / (2 * np.pi))
-    bearing_sd = np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD)
+    bearing_sd = np.hypot(np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD), doubt[:, 1] + doubt[:, 0] / np.sqrt(flat))
     told = _told(clues)
     residual = np.concatenate([(r - clues.range_m) / range_sd, off / bearing_sd])
     by = np.vstack([range_by / range_sd[:, None], bearing_by / bearing_sd[:, None]])
