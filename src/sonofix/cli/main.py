@@ -18,6 +18,7 @@ COMMANDS = {
     "check": "Say what a recording holds: beacons, codes, microphones, samples, coverage, and anything odd.",
     "simulate": "Make a recording folder: what the site's microphones would hear, 16 bit, and the truth beside it.",
     "score": "Score ranges and track of a run against the recording's truth.",
+    "team": "Place a team of robots by odometry, landmarks and each other; draw tracks and roles.",
     "explain": "Show what the receiver saw in one epoch: spectrum, searches, paths, what was cancelled and left out.",
     "codes": "Choose codes for beacons: those whose worst pair disturbs least.",
     "plan": "Map what the beacons promise over the floor, and place more where they help most.",

@@ -1,1 +1,1 @@
-"""Robots that place each other: several robots' places and peer ranges → joint estimates, roles."""
+"""Several robots that place each other: peer ranges and bearings, odometry, landmarks → joint estimates and roles."""

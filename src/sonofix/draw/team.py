@@ -1,0 +1,146 @@
+"""The picture of a team: all tracks with ellipses, how sure each robot was, and who stood while who moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from sonofix.draw import style
+from sonofix.records import Estimate, Floats, Recording, Step, Truth
+
+STANDING_MPS = 0.01
+"""A lower speed is rest."""
+
+ELLIPSES = 14
+"""Along each track."""
+
+
+def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, Truth] | None = None) -> Figure:
+    """Draw a team's tracks, deviations and roles.
+
+    Parameters
+    ----------
+    recording : Recording
+        Only its site is looked at.
+    steps : sequence of Step
+    truths : mapping from vehicle to Truth, optional
+        Adds the true paths and errors.
+
+    Returns
+    -------
+    Figure
+        16 × 10 inches, on an Agg canvas.
+    """
+    truths = truths or {}
+    tracks = tracks_of(recording, steps)
+    colours = dict(zip(tracks, style.category_colours(len(tracks)), strict=True))
+    with style.sheet() as figure:
+        plan = figure.add_axes((0.05, 0.08, 0.54, 0.80))
+        draw_landmarks(plan, recording)
+        for name, track in tracks.items():
+            colour = colours[name]
+            if name in truths and len(track):
+                true = truths[name].position_m
+                plan.plot(true[:, 0], true[:, 1], color=style.TRUTH, linewidth=0.6, alpha=0.5, zorder=2)
+            place = places(track)
+            plan.plot(*place.T, color=colour, linewidth=1.1, label=name, zorder=3)
+            for estimate in track[:: max(1, len(track) // ELLIPSES)]:
+                plan.add_patch(ellipse(estimate, colour))
+        plan.set_aspect("equal")
+        _limits(plan, recording, tracks)
+        style.dress(plan, "Tracks", "ellipses: three deviations" + ("; fine: truth" if truths else ""))
+        plan.set_xlabel("x (m)")
+        plan.set_ylabel("y (m)")
+        if tracks:
+            plan.legend(loc="upper right", fontsize=10)
+        error = figure.add_axes((0.66, 0.50, 0.32, 0.38))
+        _draw_doubt(error, tracks, truths, colours)
+        roles = figure.add_axes((0.66, 0.08, 0.32, 0.33), sharex=error)
+        _draw_roles(roles, tracks, colours)
+        roles.set_xlabel("time (s)")
+        title = recording.site.name or "team"
+        figure.text(0.05, 0.948, title, fontsize=26, fontweight="bold", color=style.INK, va="center")
+    return figure
+
+
+def tracks_of(recording: Recording, steps: Sequence[Step]) -> dict[str, list[Estimate]]:
+    """Return each vehicle's estimates in their order."""
+    tracks: dict[str, list[Estimate]] = {vehicle.id: [] for vehicle in recording.site.vehicles}
+    for step in steps:
+        for estimate in step.estimates:
+            tracks[estimate.vehicle].append(estimate)
+    return {name: track for name, track in tracks.items() if track}
+
+
+def places(track: Sequence[Estimate]) -> Floats:
+    """Return positions (n, 2)."""
+    return np.array([estimate.position_m[:2] for estimate in track]).reshape(-1, 2)
+
+
+def ellipse(estimate: Estimate, colour: str) -> Ellipse:
+    """Return the ellipse of three deviations."""
+    value, vector = np.linalg.eigh(estimate.covariance[:2, :2])
+    width, height = 6 * np.sqrt(np.maximum(value, 0.0))
+    angle = float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0])))
+    x, y = estimate.position_m[:2]
+    return Ellipse((float(x), float(y)), width, height, angle=angle, fill=False, edgecolor=colour, linewidth=0.8, alpha=0.8)
+
+
+def draw_landmarks(axes: Axes, recording: Recording) -> None:
+    """Mark beacons that stand."""
+    fixed = np.array([beacon.position_m[:2] for beacon in recording.site.beacons if beacon.position_m is not None])
+    if len(fixed):
+        axes.plot(*fixed.T, "^", color=style.MUTED, markersize=6, zorder=4, label="landmarks")
+
+
+def _limits(axes: Axes, recording: Recording, tracks: Mapping[str, Sequence[Estimate]]) -> None:
+    """Show where the robots were, and no ellipse that leaves the hall."""
+    every = [places(track) for track in tracks.values()]
+    every += [np.array([b.position_m[:2]]) for b in recording.site.beacons if b.position_m is not None]
+    if not every:
+        return
+    points = np.vstack(every)
+    low, high = np.percentile(points, 0.5, axis=0), np.percentile(points, 99.5, axis=0)
+    margin = 0.08 * float(np.max(high - low)) + 0.1
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+
+
+def _draw_doubt(
+    axes: Axes, tracks: Mapping[str, Sequence[Estimate]], truths: Mapping[str, Truth], colours: Mapping[str, str]
+) -> None:
+    for name, track in tracks.items():
+        time = np.array([estimate.time_s for estimate in track])
+        sd = np.array([np.hypot(estimate.sd("x") or 0.0, estimate.sd("y") or 0.0) for estimate in track])
+        axes.plot(time, sd, color=colours[name], linewidth=0.9, alpha=0.9)
+        if name in truths:
+            truth = truths[name]
+            inside = (time >= truth.time_s[0]) & (time <= truth.time_s[-1])
+            true = np.column_stack([np.interp(time, truth.time_s, truth.position_m[:, i]) for i in range(2)])
+            off = np.where(inside, np.hypot(*(places(track) - true).T), np.nan)
+            axes.plot(time, off, ".", color=colours[name], markersize=1.2, alpha=0.5)
+    axes.set_yscale("log")
+    axes.tick_params(labelbottom=False)
+    axes.set_ylabel("m")
+    style.dress(axes, "Deviation of position", "dots: error against the truth" if truths else "")
+
+
+def _draw_roles(axes: Axes, tracks: Mapping[str, Sequence[Estimate]], colours: Mapping[str, str]) -> None:
+    """One lane a robot: thin where it stands (others place themselves by it), thick where it moves, none where unplaced."""
+    for lane, (name, track) in enumerate(tracks.items()):
+        time = np.array([estimate.time_s for estimate in track])
+        moves = np.array([np.hypot(*estimate.velocity_mps[:2]) > STANDING_MPS for estimate in track])
+        apart = np.concatenate([np.diff(time) > 5.0, [True]])
+        changes = np.flatnonzero(np.concatenate([[True], moves[1:] != moves[:-1]]) | np.concatenate([[True], apart[:-1]]))
+        for a, b in zip(changes, [*changes[1:], len(time)], strict=True):
+            end = time[b] if b < len(time) and not apart[b - 1] else time[b - 1]
+            height = 0.62 if moves[a] else 0.16
+            axes.broken_barh([(time[a], max(end - time[a], 1e-3))], (lane - height / 2, height), color=colours[name])
+    axes.set_yticks(range(len(tracks)), list(tracks))
+    axes.set_ylim(len(tracks) - 0.4, -0.6)
+    style.dress(axes, "Roles", "thick: explores; thin: stands as a base")
+    axes.grid(False, axis="y")

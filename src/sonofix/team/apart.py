@@ -1,0 +1,236 @@
+"""The team as it truly is: each robot keeps an estimate of itself alone, by its own sensors and what others tell it.
+
+When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that both
+know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013): the part of
+an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and 1/(1 − w); the part
+that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has been told. So estimates
+are never surer than they may be, whoever tells whom however often, joins or leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Event, Floats
+from sonofix.team.feed import COMPASS, Feed
+from sonofix.team.fleet import ASK_S, LEFT_S, START_SD, Belief, Moment, Watch, instants
+from sonofix.team.message import SENT, Message, unpack
+from sonofix.team.noise import Noise, noise
+from sonofix.team.placing import Placed, place
+from sonofix.team.recent import Recent
+from sonofix.team.state import POSE, SIZE
+
+SHARES = (0.3, 0.5, 0.7, 0.85, 0.95)
+"""Weights w of a robot's own estimate that are tried; the one that leaves its place best known is taken."""
+
+GAIN = 0.8
+"""The determinant of a pose's covariance must fall to so much of itself, or nothing is changed."""
+
+EVERY_S = 1.0
+"""Two robots that meet tell each other no more often."""
+
+UNSURE = (1.5, 0.7)
+"""In m and rad: a robot that knows its place no better is to be placed anew, as corrections are no longer linear."""
+
+
+class Apart:
+    """V robots' estimates of themselves, side by side; none looks into another's.
+
+    ``belief`` holds them in one vector with no covariance between them; ``dependent`` (SIZE V, SIZE V) is the part of
+    each covariance that others may share; each robot learns noise of its own. ``told`` counts messages.
+    """
+
+    def __init__(self, feed: Feed) -> None:
+        self.feed = feed
+        self.belief = Belief.blank(feed)
+        self.dependent = np.zeros_like(self.belief.covariance)
+        self._noise: list[Noise] = [noise(len(feed.robots), feed.pairs, feed.own_ranges) for _ in feed.robots]
+        self._last_s: dict[tuple[int, int], float] = {}
+        self.told = 0
+
+    def own(self, robot: int) -> slice:
+        """Where a robot's states stand."""
+        return slice(SIZE * robot, SIZE * (robot + 1))
+
+    def drive(self, from_s: float, until_s: float) -> None:
+        """Carry every robot on by its own odometry."""
+        self.belief.drive(self.feed, from_s, until_s)
+        for robot in np.flatnonzero(self.belief.placed).tolist():
+            carry = np.eye(SIZE)
+            carry[:POSE] = self.belief.by[robot]
+            at = self.own(robot)
+            self.dependent[at, at] = carry @ self.dependent[at, at] @ carry.T
+
+    def hear(self, row: int) -> tuple[NDArray[np.bool_], Floats]:
+        """Take one row in, at both its ends; return what `Belief.hear` does of it."""
+        feed = self.feed
+        ends = [robot for robot in (int(feed.listener[row]), int(feed.source[row])) if robot >= 0]
+        told = self._noise[ends[0]]
+        if len(ends) == 1 or feed.kind[row] == COMPASS:
+            return self._alone(row, ends[0], told)
+        time_s = float(feed.time_s[row])
+        meeting = (min(ends), max(ends))
+        often = time_s - self._last_s.get(meeting, -np.inf) < EVERY_S
+        if often or not all(self.belief.placed[end] for end in ends):
+            return np.zeros((1, 2), bool), np.full((1, 2, 4), np.nan)
+        self._last_s[meeting] = time_s
+        return self._exchange(row, ends[0], ends[1], told)
+
+    def _alone(self, row: int, robot: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
+        """Correct a robot by what nobody else knows of."""
+        at, belief = self.own(robot), replace_noise(self.belief, told)
+        before = belief.covariance[at, at].copy()
+        used, found = belief.hear(self.feed, (row, row + 1))
+        belief.learn(self.feed, (row, row + 1), used, found)
+        if used.any():
+            # all corrections together are x' = A x + K z with A P = P'; states that are known have no part in it
+            kept = belief.covariance[at, at] @ np.linalg.pinv(before, hermitian=True)
+            self.dependent[at, at] = kept @ self.dependent[at, at] @ kept.T
+        return used, found
+
+    def _exchange(self, row: int, listener: int, source: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
+        """Let two robots that meet tell each other, and correct themselves by it."""
+        time_s = float(self.feed.time_s[row])
+        said = {robot: unpack(self._say(robot, time_s)) for robot in (listener, source)}
+        self.told += 2
+        mean, covariance = self.belief.mean.copy(), self.belief.covariance.copy()
+        result = np.zeros((1, 2), bool), np.full((1, 2, 4), np.nan)
+        corrected: dict[int, tuple[Floats, Floats]] = {}
+        for robot, other in ((listener, source), (source, listener)):
+            best: tuple[float, Floats, Floats] | None = None
+            for share in SHARES:
+                bound = self._bound(mean, covariance, robot, said[other], share)
+                heard = bound.hear_with(self.feed, row, told)
+                at = self.own(robot)
+                size = float(np.linalg.det(bound.belief.covariance[at, at][:POSE, :POSE]))
+                if heard[0].any() and (best is None or size < best[0]):
+                    best = size, bound.belief.mean[at].copy(), bound.belief.covariance[at, at].copy()
+                    if robot == listener:
+                        result = heard
+            now = float(np.linalg.det(covariance[self.own(robot), self.own(robot)][:POSE, :POSE]))
+            if best is not None and best[0] < GAIN * now:
+                corrected[robot] = best[1], best[2]
+            if robot == listener and best is None:
+                result = heard
+        for robot in (listener, source):
+            at = self.own(robot)
+            if robot in corrected:
+                self.belief.mean[at], self.belief.covariance[at, at] = corrected[robot]
+            self.dependent[at, at] = self.belief.covariance[at, at]
+        return result
+
+    def _say(self, robot: int, time_s: float) -> bytes:
+        """Return a robot's message."""
+        at = np.array(SENT) + SIZE * robot
+        both = np.ix_(at, at)
+        nothing = np.full(4, np.nan)
+        return Message(
+            robot, time_s, self.belief.mean[at], self.belief.covariance[both], self.dependent[both], nothing
+        ).pack()
+
+    def _bound(self, mean: Floats, covariance: Floats, robot: int, other: Message, share: float) -> _Bound:
+        """Return a belief of a robot and one that it hears of, which holds whatever they share."""
+        bound = np.zeros_like(covariance)
+        at = self.own(robot)
+        shared = self.dependent[at, at]
+        bound[at, at] = covariance[at, at] + (1.0 / share - 1.0) * shared
+        of = np.array(SENT) + SIZE * other.sender
+        bound[np.ix_(of, of)] = other.covariance + (1.0 / (1.0 - share) - 1.0) * other.dependent
+        about = mean.copy()
+        about[of] = other.mean
+        return _Bound(replace(self.belief, mean=about, covariance=bound))
+
+
+class _Bound:
+    """A belief made for one correction."""
+
+    def __init__(self, belief: Belief) -> None:
+        self.belief = belief
+
+    def hear_with(self, feed: Feed, row: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
+        """Take a row in, with what its listener knows of its noise."""
+        return replace_noise(self.belief, told).hear(feed, (row, row + 1))
+
+
+def replace_noise(belief: Belief, told: Noise) -> Belief:
+    """Return the same belief, changed in place alike, with the noise that one robot has learnt."""
+    return replace(belief, noise=told)
+
+
+def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
+    """Run every robot's own filter over a feed, causally.
+
+    Yields
+    ------
+    Moment, one an instant, and the robots behind it, which go on changing
+    """
+    team = Apart(feed)
+    belief, watch, recent = team.belief, Watch(len(feed.robots)), Recent(feed)
+    for robot, start in feed.starts.items():
+        belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
+    now: float | None = None
+    asked_s = -np.inf
+    for time_s, first, last in instants(feed):
+        events: list[Event] = []
+        team.drive(time_s if now is None else now, time_s)
+        now = time_s
+        used, told = np.zeros((last - first, 2), bool), np.full((last - first, 2, 4), np.nan)
+        for i in range(first, last):
+            used[i - first], told[i - first] = (part[0] for part in team.hear(i))
+        watch.see(feed, (first, last), used, told)
+        found = watch.astray()
+        if found is not None:
+            robot = found[0]
+            watch.clear(robot)
+            _lift(team, recent, robot)
+            text = "what is heard disagrees with its track: to be placed anew"
+            events.append(Event(time_s, feed.robots[robot], "lost", text))
+        recent.add(belief.mean, belief.placed, (first, last))
+        if time_s - asked_s >= ASK_S:
+            asked_s = time_s
+            for robot in range(len(feed.robots)):
+                if belief.placed[robot] and time_s - recent.told_s(robot, time_s) > LEFT_S:
+                    _lift(team, recent, robot)
+                    events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
+                elif belief.placed[robot] and _unsure(belief, robot):
+                    _lift(team, recent, robot)
+                    events.append(Event(time_s, feed.robots[robot], "lost", "it hardly knows where it is"))
+                elif not belief.placed[robot]:
+                    _join(team, recent, robot, time_s, events)
+        yield belief.moment(time_s, (first, last), used, events), team
+
+
+def _unsure(belief: Belief, robot: int) -> bool:
+    variance = np.diag(belief.covariance)[belief.at(robot)]
+    return bool(max(variance[0], variance[1]) > UNSURE[0] ** 2 or variance[2] > UNSURE[1] ** 2)
+
+
+def _lift(team: Apart, recent: Recent, robot: int) -> None:
+    at = team.belief.at(robot)
+    team.belief.lift(robot)
+    team.dependent[at, :] = team.dependent[:, at] = 0.0
+    recent.forget(robot)
+
+
+def _join(team: Apart, recent: Recent, robot: int, time_s: float, events: list[Event]) -> None:
+    """Place a robot by landmarks and by what others said of themselves, whose errors may all be shared."""
+    belief = team.belief
+    clues = recent.clues(robot, time_s, belief.placed)
+    found = None if clues is None else place(clues, belief.mean[belief.at(robot)])
+    if found is None:
+        return
+    covariance = found.covariance.copy()
+    for who, by in found.by.items():
+        covariance += len(found.by) * by @ belief.covariance[belief.at(who), belief.at(who)] @ by.T
+    belief.put(robot, Placed(found.pose, covariance, {}))
+    at = team.own(robot)
+    team.dependent[at, at] = belief.covariance[at, at]
+    for who in found.by:
+        team.dependent[team.own(who), team.own(who)] = belief.covariance[team.own(who), team.own(who)]
+    x, y, yaw = found.pose
+    text = f"placed at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
+    events.append(Event(time_s, team.feed.robots[robot], "joined", text))

@@ -1,0 +1,237 @@
+"""What a team's filter takes in: a recording's odometry, ranges, bearings and compasses as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Floats, RangeRows, Recording, Table
+from sonofix.site import Site
+
+SIGHTING, COMPASS = range(2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Feed:
+    """All that a team's robots told, of V robots.
+
+    Attributes
+    ----------
+    robots : tuple of str
+    level_m : float64 (V,)
+        Height of each robot's origin.
+    first : int64 (V + 1,)
+        Where each robot's rows of odometry begin.
+    odometry_s, odometry : float64 (k,), (k, 2)
+        Their times; speed (m/s) and yaw rate (rad/s), held until the robot's next row.
+    time_s : float64 (n,)
+        When each row was heard, in order.
+    kind : int64 (n,)
+        `SIGHTING` or `COMPASS` (``bearing_rad`` then is the listener's heading).
+    listener, source : int64 (n,)
+        Robots; −1: fixed in place.
+    listener_point, source_point : float64 (n, 3)
+        Place of a fixed end, lever arm (forward, left) and height in the frame of a mounted one.
+    range_m, range_sd_m, bearing_rad : float64 (n,)
+        NaN where not measured, or not stated.
+    pair : int64 (n,)
+        Number of its pair of ends.
+    ends : tuple of (emitter, receiver), length n
+        Ids, as the recording has them.
+    own_ranges : bool
+        Ranges are this receiver's own, whose deviations are to be believed.
+    sound_speed_mps : float
+    starts : mapping from robot index to (x, y, yaw)
+    """
+
+    robots: tuple[str, ...]
+    level_m: Floats
+    first: NDArray[np.int64]
+    odometry_s: Floats
+    odometry: Floats
+    time_s: Floats
+    kind: NDArray[np.int64]
+    listener: NDArray[np.int64]
+    source: NDArray[np.int64]
+    listener_point: Floats
+    source_point: Floats
+    range_m: Floats
+    range_sd_m: Floats
+    bearing_rad: Floats
+    pair: NDArray[np.int64]
+    ends: tuple[tuple[str, str], ...]
+    own_ranges: bool
+    sound_speed_mps: float
+    starts: dict[int, tuple[float, float, float]]
+
+    @property
+    def pairs(self) -> int:
+        """How many pairs of ends there are."""
+        return int(self.pair.max()) + 1 if len(self.pair) else 0
+
+    def keep(self, rows: NDArray[np.bool_]) -> Feed:
+        """Return the feed with some of its rows alone."""
+        cut = {
+            name: getattr(self, name)[rows]
+            for name in (
+                "time_s",
+                "kind",
+                "listener",
+                "source",
+                "listener_point",
+                "source_point",
+                "range_m",
+                "range_sd_m",
+                "bearing_rad",
+                "pair",
+            )
+        }
+        return replace(self, **cut, ends=tuple(e for e, kept in zip(self.ends, rows.tolist(), strict=True) if kept))
+
+
+def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bool = False) -> Feed:
+    """Bring a recording of several robots into arrays.
+
+    Parameters
+    ----------
+    recording : Recording
+    ranges : RangeRows or None
+        In place of the recording's own, which it may lack.
+    own_ranges : bool
+        See `Feed`.
+
+    Raises
+    ------
+    ValueError
+        If no robot has odometry, or nothing was heard.
+    """
+    site = recording.site
+    robots = tuple(vehicle.id for vehicle in site.vehicles)
+    level = np.array([vehicle.z_m or 0.0 for vehicle in site.vehicles])
+    first, odometry_s, odometry = _odometry(recording.tables.get("odometry"), robots)
+    if not len(odometry_s):
+        raise ValueError("odometry.csv: a team is carried by the odometry of its robots, and there is none")
+    rows = _sightings(ranges if ranges is not None else recording.ranges, recording.tables.get("bearings"))
+    if not rows:
+        raise ValueError("ranges.csv, bearings.csv: neither has a row, so no robot can be placed")
+    compass = recording.tables.get("compass")
+    if compass is not None:
+        whose = compass.names.get("vehicle") or (robots[0],) * len(compass.columns["time_s"])
+        told = compass.columns
+        rows += [
+            (float(t), COMPASS, name, name, np.nan, np.nan, float(heading))
+            for t, name, heading in zip(told["time_s"], whose, told["heading_rad"], strict=True)
+            if np.isfinite(heading)
+        ]
+    rows.sort(key=lambda row: row[0])
+    ends = tuple((row[2], row[3]) for row in rows)
+    numbers = {end: i for i, end in enumerate(dict.fromkeys(ends))}
+    place = {end: _ends(site, robots, level, end) for end in numbers}
+    kind = np.array([row[1] for row in rows], np.int64)
+    listener = np.array([place[end][0] if k == SIGHTING else robots.index(end[1]) for end, k in zip(ends, kind, strict=True)])
+    return Feed(
+        robots=robots,
+        level_m=level,
+        first=first,
+        odometry_s=odometry_s,
+        odometry=odometry,
+        time_s=np.array([row[0] for row in rows]),
+        kind=kind,
+        listener=listener.astype(np.int64),
+        source=np.array([place[end][1] for end in ends], np.int64),
+        listener_point=np.array([place[end][2] for end in ends]),
+        source_point=np.array([place[end][3] for end in ends]),
+        range_m=np.array([row[4] for row in rows]),
+        range_sd_m=np.array([row[5] for row in rows]),
+        bearing_rad=np.array([row[6] for row in rows]),
+        pair=np.array([numbers[end] for end in ends], np.int64),
+        ends=ends,
+        own_ranges=own_ranges,
+        sound_speed_mps=site.sound_speed_mps,
+        starts=_starts(recording.tables.get("start"), robots),
+    )
+
+
+def heard_by(feed: Feed, landmarks_of: Iterable[str] | None = None, peers: bool = True) -> Feed:
+    """Return the feed without landmarks that some robots shall not hear, and without peers where asked.
+
+    ``landmarks_of``: the robots that hear fixed beacons (or are heard by fixed microphones); None: all do.
+    """
+    keep = np.ones(len(feed.time_s), bool)
+    fixed = (feed.kind == SIGHTING) & ((feed.source < 0) | (feed.listener < 0))
+    if landmarks_of is not None:
+        robot = np.maximum(feed.listener, feed.source)
+        keep &= ~fixed | np.isin(robot, [feed.robots.index(name) for name in landmarks_of])
+    if not peers:
+        keep &= fixed | (feed.kind == COMPASS)
+    return feed.keep(keep)
+
+
+def _odometry(table: Table | None, robots: tuple[str, ...]) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Rows of odometry, robot by robot."""
+    if table is None:
+        return np.zeros(len(robots) + 1, np.int64), np.zeros(0), np.zeros((0, 2))
+    time_s = table.columns["time_s"]
+    whose = np.array(table.names.get("vehicle") or (robots[0],) * len(time_s))
+    told = np.column_stack([table.columns["v_mps"], table.columns["yaw_rate_radps"]])
+    parts = [np.flatnonzero(whose == robot) for robot in robots]
+    parts = [rows[np.argsort(time_s[rows], kind="stable")] for rows in parts]
+    order = np.concatenate(parts)
+    first = np.concatenate([[0], np.cumsum([len(rows) for rows in parts])]).astype(np.int64)
+    return first, np.ascontiguousarray(time_s[order]), np.ascontiguousarray(told[order])
+
+
+_Row = tuple[float, int, str, str, float, float, float]
+
+
+def _sightings(ranges: RangeRows | None, bearings: Table | None) -> list[_Row]:
+    """Ranges and bearings, one row for both where the same ends have both at the same instant."""
+    found: dict[tuple[float, str, str, int], _Row] = {}
+    if ranges is not None:
+        sd = np.full(len(ranges.time_s), np.nan) if ranges.sd_m is None else ranges.sd_m
+        told = zip(ranges.time_s.tolist(), ranges.emitter, ranges.receiver, ranges.range_m.tolist(), sd.tolist(), strict=True)
+        for i, (t, emitter, receiver, r, s) in enumerate(told):
+            if np.isfinite(r):
+                again = i if (t, emitter, receiver, -1) in found else -1
+                found[t, emitter, receiver, again] = (t, SIGHTING, emitter, receiver, r, s, np.nan)
+    if bearings is not None:
+        told = zip(bearings.columns["time_s"].tolist(), bearings.names["from"], bearings.names["to"], bearings.columns["bearing_rad"].tolist(), strict=True)
+        for i, (t, emitter, receiver, bearing) in enumerate(told):
+            if not np.isfinite(bearing):
+                continue
+            key = (t, emitter, receiver, -1)
+            row = found.get(key)
+            if row is not None and not np.isfinite(row[6]):
+                found[key] = (*row[:6], bearing)
+            else:
+                found[(t, emitter, receiver, -2 - i) if row is not None else key] = (t, SIGHTING, emitter, receiver, np.nan, np.nan, bearing)
+    return list(found.values())
+
+
+def _ends(site: Site, robots: tuple[str, ...], level_m: Floats, end: tuple[str, str]) -> tuple[int, int, Floats, Floats]:
+    """Robots (−1: none) and points of a row's listener and source."""
+    emitter, receiver = end
+    beacons, microphones = {b.id: b for b in site.beacons}, {m.id: m for m in site.microphones}
+    out: list[tuple[int, Floats]] = []
+    for name, nodes in ((receiver, microphones), (emitter, beacons)):
+        node = nodes.get(name)
+        if node is None:
+            out.append((robots.index(name) if name in robots else -1, np.zeros(3)))
+        elif node.vehicle is None:
+            out.append((-1, np.array(node.position_m)))
+        else:
+            who = robots.index(node.vehicle)
+            out.append((who, np.array(node.lever_arm_m) + [0.0, 0.0, level_m[who]]))
+    return out[0][0], out[1][0], out[0][1], out[1][1]
+
+
+def _starts(table: Table | None, robots: tuple[str, ...]) -> dict[int, tuple[float, float, float]]:
+    """Start poses that are stated whole."""
+    if table is None:
+        return {}
+    whose = table.names.get("vehicle") or (robots[0],) * len(table.columns["x_m"])
+    told = zip(whose, table.columns["x_m"], table.columns["y_m"], table.columns["yaw_rad"], strict=True)
+    return {robots.index(who): (float(x), float(y), float(yaw)) for who, x, y, yaw in told if np.isfinite(x + y + yaw)}

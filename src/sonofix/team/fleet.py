@@ -1,0 +1,376 @@
+"""The team as one: a joint filter over all robots, with every measurement taken in at its own time, exactly."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Event, Floats
+from sonofix.team.feed import Feed
+from sonofix.team.hear import hear, learn
+from sonofix.team.kernel import advance
+from sonofix.team.noise import Noise, noise
+from sonofix.team.placing import Placed, place
+from sonofix.team.recent import Recent
+from sonofix.team.state import POSE, SIZE, prior, prior_sd, wander_psd
+
+START_SD = (0.05, 0.05, 0.1)
+"""Of a stated start pose, in m and rad."""
+
+FILL_S = 1.0
+"""Where nothing is heard for longer, a row tells how the doubt grows."""
+
+ASK_S = 1.0
+"""How often it is tried to place a robot."""
+
+LEFT_S = 10.0
+"""A robot of which nothing comes for so long has left."""
+
+JUDGED = 6
+"""Latest measurements by which it is judged whether a robot is where its track has it."""
+
+SLIPPED = (1.0, 1.0, 0.5)
+"""How far aside a robot may be found that was pushed, in m and rad."""
+
+ITERATED = 8
+
+EXPLAINED = 0.7
+"""Share of what was heard since that a slip must explain."""
+
+REWOUND_S = 2.0
+"""A slip is looked for so far back."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """What is believed of V robots at one instant.
+
+    Attributes
+    ----------
+    time_s : float
+    pose : float64 (V, 3)
+        x, y, yaw of each.
+    covariance : float64 (V, 3, 3)
+        Of each robot's pose.
+    speed_mps : float64 (V,)
+    placed : bool (V,)
+        Whether the pose means anything.
+    rows : (first, last)
+        Rows of the feed that were heard now.
+    used : bool (rows, 2)
+        Their ranges and bearings taken.
+    events : tuple of Event
+    """
+
+    time_s: float
+    pose: Floats
+    covariance: Floats
+    speed_mps: Floats
+    placed: NDArray[np.bool_]
+    rows: tuple[int, int]
+    used: NDArray[np.bool_]
+    events: tuple[Event, ...] = ()
+
+
+def instants(feed: Feed) -> list[tuple[float, int, int]]:
+    """Return the instants of a feed with their rows (first, last); empty ones fill silences of `FILL_S`."""
+    changes = np.flatnonzero(np.diff(feed.time_s) > 0) + 1
+    edges = [0, *changes.tolist(), len(feed.time_s)] if len(feed.time_s) else [0]
+    begin, end = float(feed.odometry_s.min()), float(feed.odometry_s.max())
+    out: list[tuple[float, int, int]] = []
+    last = min(begin, float(feed.time_s[0])) if len(feed.time_s) else begin
+    for a, b in zip(edges, edges[1:], strict=False):
+        time = float(feed.time_s[a])
+        out += [(t, a, a) for t in _between(last, time)]
+        out.append((time, a, b))
+        last = time
+    return out + [(t, len(feed.time_s), len(feed.time_s)) for t in _between(last, end + 1e-9)]
+
+
+def _between(after_s: float, before_s: float) -> list[float]:
+    count = int(np.ceil((before_s - after_s) / FILL_S)) - 1
+    return [after_s + FILL_S * (i + 1) for i in range(count)]
+
+
+@dataclass(eq=False, slots=True)
+class Belief:
+    """Joint Gaussian over all robots, changed in place.
+
+    Attributes
+    ----------
+    mean, covariance : float64 (SIZE V,), (SIZE V, SIZE V)
+        Of robots not placed the mean alone is carried on, in the frame of their own odometry.
+    placed : bool (V,)
+    noise : Noise
+    speed : float64 (V,)
+    """
+
+    mean: Floats
+    covariance: Floats
+    placed: NDArray[np.bool_]
+    noise: Noise
+    speed: Floats
+    by: Floats = field(init=False)
+    drive_noise: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Make room for what kernels write."""
+        self.by = np.zeros((len(self.placed), POSE, SIZE))
+        self.drive_noise = np.zeros((len(self.placed), POSE, POSE))
+
+    @classmethod
+    def blank(cls, feed: Feed) -> Belief:
+        """Return what is believed before anything was heard: nothing but how large errors may be."""
+        robots = len(feed.robots)
+        sd = np.tile(prior_sd(feed.own_ranges), robots)
+        covariance = np.diag(sd**2)
+        for r in range(robots):
+            at = slice(SIZE * r, SIZE * r + POSE)
+            covariance[at, at] = 0.0
+        return cls(
+            np.tile(prior(), robots),
+            covariance,
+            np.zeros(robots, bool),
+            noise(robots, feed.pairs, feed.own_ranges),
+            np.zeros(robots),
+        )
+
+    def at(self, robot: int) -> slice:
+        """Where a robot's pose stands."""
+        return slice(SIZE * robot, SIZE * robot + POSE)
+
+    def drive(self, feed: Feed, from_s: float, until_s: float) -> None:
+        """Carry all robots on."""
+        psd = wander_psd(feed.own_ranges)
+        advance(
+            self.mean, self.covariance, self.mean, self.placed, feed.first, feed.odometry_s, feed.odometry,
+            from_s, until_s, psd, self.by, self.drive_noise, self.speed,
+        )  # fmt: skip
+
+    def hear(
+        self, feed: Feed, rows: tuple[int, int], about: Floats | None = None
+    ) -> tuple[NDArray[np.bool_], Floats]:
+        """Take measurements in; return which ranges and bearings were, and what `hear.hear` tells of them.
+
+        They are linearised ``about`` some state, or else at the mean as it moves.
+        """
+        count = rows[1] - rows[0]
+        used = np.zeros((count, 2), bool)
+        found = np.full((count, 2, 4), np.nan)
+        told = self.noise
+        hear(
+            self.mean, self.covariance, self.mean if about is None else about, self.placed, rows, feed.time_s, feed.kind, feed.listener, feed.source,
+            feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.pair,
+            told.ranges, told.bearings, told.share, told.last_s, told.believed, 1.0 / feed.sound_speed_mps, self.speed,
+            used, found, np.empty((3, len(self.mean))),
+        )  # fmt: skip
+        return used, found
+
+    def learn(self, feed: Feed, rows: tuple[int, int], used: NDArray[np.bool_], found: Floats) -> None:
+        """Learn how good measurements are from those just taken in."""
+        told = self.noise
+        learn(
+            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.pair, told.ranges,
+            told.bearings, told.share, told.last_s, told.last, told.believed, used, found,
+        )  # fmt: skip
+
+    def put(self, robot: int, found: Placed) -> None:
+        """Place a robot, with what its place shares with those of the robots it was found by."""
+        at = self.at(robot)
+        shared = np.zeros((POSE, len(self.mean)))
+        for who, by in found.by.items():
+            shared += by @ self.covariance[self.at(who)]
+        own = found.covariance.copy()
+        for who, by in found.by.items():
+            own += shared[:, self.at(who)] @ by.T
+        shared[:, at] = 0.5 * (own + own.T)
+        self.mean[at] = found.pose
+        self.covariance[at, :] = shared
+        self.covariance[:, at] = shared.T
+        self.placed[robot] = True
+
+    def lift(self, robot: int) -> None:
+        """Take a robot's place away; what is known of its odometry stays."""
+        self.covariance[self.at(robot), :] = 0.0
+        self.covariance[:, self.at(robot)] = 0.0
+        self.placed[robot] = False
+
+    def loosen(self, robot: int, sd: tuple[float, ...]) -> None:
+        """Open a robot's pose by so much."""
+        at = self.at(robot)
+        self.covariance[at, at] += np.diag(np.square(sd))
+
+    def moment(self, time_s: float, rows: tuple[int, int], used: NDArray[np.bool_], events: list[Event]) -> Moment:
+        """Return what is believed now."""
+        robots = range(len(self.placed))
+        pose = np.array([self.mean[self.at(r)] for r in robots])
+        covariance = np.array([self.covariance[self.at(r), self.at(r)] for r in robots])
+        return Moment(time_s, pose, covariance, self.speed.copy(), self.placed.copy(), rows, used, tuple(events))
+
+
+class Watch:
+    """Judges whether robots are where their tracks have them, by which of their latest measurements were refused."""
+
+    def __init__(self, robots: int) -> None:
+        self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
+
+    def clear(self, robot: int) -> None:
+        """Forget what was refused."""
+        self._latest[robot].clear()
+
+    def see(self, feed: Feed, rows: tuple[int, int], used: NDArray[np.bool_], told: Floats) -> None:
+        """Note what became of some measurements."""
+        for k, i in enumerate(range(*rows)):
+            asked = np.isfinite(told[k, :, 0])
+            for robot in {int(feed.listener[i]), int(feed.source[i])} - {-1}:
+                if feed.kind[i] == 0 and asked.any():
+                    self._latest[robot].append((i, int(feed.pair[i]), bool(np.all(used[k][asked]))))
+
+    def astray(self) -> tuple[int, list[int]] | None:
+        """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
+
+        These are the latest of each pair; None: there is no such robot, or too little to find it by.
+        """
+        worst: tuple[float, int, list[int]] | None = None
+        for robot, latest in enumerate(self._latest):
+            if len(latest) < 4 or any(ok for _, _, ok in list(latest)[-3:]):
+                continue
+            refused = {pair: row for row, pair, ok in latest if not ok}
+            share = sum(not ok for _, _, ok in latest) / len(latest)
+            if len(refused) >= 2 and share >= 0.6 and (worst is None or share > worst[0]):
+                worst = share, robot, sorted(refused.values())
+        return None if worst is None else worst[1:]
+
+
+def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Belief]]:
+    """Run the joint filter over a feed, causally.
+
+    Parameters
+    ----------
+    feed : Feed
+    until_placed : bool
+        A robot listens until it is placed, then drives by its odometry alone: what odometry is worth.
+
+    Yields
+    ------
+    Moment, one an instant, and the belief behind it, which goes on changing
+    """
+    belief = Belief.blank(feed)
+    watch, recent = Watch(len(feed.robots)), Recent(feed)
+    for robot, start in feed.starts.items():
+        belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
+    past: deque[_Before] = deque()
+    now: float | None = None
+    asked_s = left_s = -np.inf
+    for time_s, first, last in instants(feed):
+        events: list[Event] = []
+        rows = (first, last)
+        belief.drive(feed, time_s if now is None else now, time_s)
+        now = time_s
+        if time_s - left_s >= ASK_S:
+            left_s = time_s
+            _leave(belief, feed, recent, time_s, events)
+        frozen = until_placed and belief.placed.all()
+        count = last - first
+        used, told = np.zeros((count, 2), bool), np.full((count, 2, 4), np.nan)
+        if count and not until_placed:
+            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy()))
+            while time_s - past[0].time_s > REWOUND_S:
+                past.popleft()
+            used, told = belief.hear(feed, rows)
+            watch.see(feed, rows, used, told)
+            found = watch.astray()
+            if found is not None:
+                _reopen(belief, feed, found, watch, recent, past, events)
+            belief.learn(feed, rows, used, told)
+        if not frozen:
+            recent.add(belief.mean, belief.placed, rows)
+            if not belief.placed.all() and time_s - asked_s >= ASK_S:
+                asked_s = time_s
+                _place(belief, feed, recent, time_s, events)
+        yield belief.moment(time_s, rows, used, events), belief
+
+
+def _leave(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: list[Event]) -> None:
+    """Take away robots of which nothing came for long."""
+    for robot in np.flatnonzero(belief.placed).tolist():
+        if time_s - recent.told_s(robot, time_s) > LEFT_S:
+            belief.lift(robot)
+            recent.forget(robot)
+            events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
+
+
+def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: list[Event]) -> None:
+    """Place the robots that now can be."""
+    for robot in np.flatnonzero(~belief.placed).tolist():
+        clues = recent.clues(robot, time_s, belief.placed)
+        found = None if clues is None else place(clues, belief.mean[belief.at(robot)])
+        if found is not None:
+            belief.put(robot, found)
+            x, y, yaw = found.pose
+            text = f"placed at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
+            events.append(Event(time_s, feed.robots[robot], "joined", text))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Before:
+    """A belief as it was before what was heard at an instant."""
+
+    time_s: float
+    rows: tuple[int, int]
+    mean: Floats
+    covariance: Floats
+
+
+def _reopen(
+    belief: Belief,
+    feed: Feed,
+    found: tuple[int, list[int]],
+    watch: Watch,
+    recent: Recent,
+    past: Sequence[_Before],
+    events: list[Event],
+) -> None:
+    """Find a robot that is not where its track has it: open its place where that began, and hear anew what came since.
+
+    Far from where it was, a first linearisation is a poor one, so it is done about what it led to, again and again (Bell
+    and Cathey 1993). Where that explains too little, the robot's place is taken away.
+    """
+    robot, rows = found
+    watch.clear(robot)
+    kept, now_s = (belief.mean.copy(), belief.covariance.copy()), past[-1].time_s
+    since = [before for before in past if before.rows[1] > rows[0]]
+    at, shift, taken = belief.at(robot), np.zeros(POSE), 0.0
+    for _ in range(ITERATED):
+        belief.mean[:], belief.covariance[:] = since[0].mean, since[0].covariance
+        belief.loosen(robot, SLIPPED)
+        track = belief.mean.copy()
+        used: list[bool] = []
+        for i, step in enumerate(since):
+            if i:
+                last_s = since[i - 1].time_s
+                own, shared = belief.mean.copy(), belief.covariance.copy()
+                belief.mean[:] = track
+                belief.drive(feed, last_s, step.time_s)
+                track = belief.mean.copy()
+                belief.mean[:], belief.covariance[:] = own, shared
+                belief.drive(feed, last_s, step.time_s)
+            about = belief.mean.copy()
+            about[at] = track[at] + shift
+            heard, _ = belief.hear(feed, step.rows, about)
+            own_rows = [k for k, row in enumerate(range(*step.rows)) if robot in (feed.listener[row], feed.source[row])]
+            used += [bool(heard[k].any()) for k in own_rows]
+        shift, taken = belief.mean[at] - track[at], float(np.mean(used))
+    apart = float(np.hypot(*(belief.mean[at] - kept[0][at])[:2]))
+    if taken >= EXPLAINED:
+        text = f"what is heard disagrees with its odometry: {apart:.2f} m from where that had it"
+        events.append(Event(now_s, feed.robots[robot], "slip", text))
+        return
+    belief.mean[:], belief.covariance[:] = kept
+    belief.lift(robot)
+    recent.forget(robot)
+    events.append(Event(now_s, feed.robots[robot], "lost", "what is heard disagrees with its track: to be placed anew"))

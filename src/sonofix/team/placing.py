@@ -1,0 +1,210 @@
+"""Where a robot is that nobody has placed yet: from what was heard within some seconds, and its odometry meanwhile.
+
+Its own odometry gives its way in a frame of its own; three numbers bring that into the frame of the site. All
+directions are tried, each is bettered by robust Gauss–Newton steps, and the best is taken where no other comes near.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Floats
+from sonofix.track.stated import BEGIN_SD_M, SCALE_SD
+from sonofix.track.wheels import COMPASS_SD_RAD
+
+DIRECTIONS = 12
+"""Headings tried."""
+
+STEPS = 15
+"""Gauss–Newton steps of each."""
+
+BEARING_SD_RAD = 0.05
+"""Taken for bearings of which nothing is learnt yet."""
+
+LIMIT = 3.0
+"""A residual of more deviations counts as this many: it is another thing that was heard."""
+
+RIVALS = 9.0
+"""How much more another place must cost."""
+
+AGREEING = 0.7
+"""Share of the rows that must be within `LIMIT`."""
+
+PLACED_SD = (0.5, 0.3)
+"""In m and rad: a place that is known no better is none."""
+
+WAY_SD, TURN_SD = 0.1, 0.15
+"""Of odometry whose errors are not known, per metre and radian."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clues:
+    """What may place one robot, a row each of m.
+
+    Attributes
+    ----------
+    own : float64 (m, 3)
+        The robot's pose in the frame of its odometry.
+    other : float64 (m, 3)
+        Pose of the end that it heard, or that heard it, lever arm included; yaw 0 where fixed.
+    anchor : int (m,)
+        Which placed robot that is; −1: a fixed end.
+    listens : bool (m,)
+        The robot itself heard; else the other did.
+    arm : float64 (m, 3)
+        Lever arm of its own end, and how much higher the other one is.
+    range_m, bearing_rad : float64 (m,)
+        NaN where not measured.
+    compass : bool (m,)
+        ``bearing_rad`` is the robot's heading, by its compass.
+    """
+
+    own: Floats
+    other: Floats
+    anchor: NDArray[np.int64]
+    listens: NDArray[np.bool_]
+    arm: Floats
+    range_m: Floats
+    bearing_rad: Floats
+    compass: NDArray[np.bool_]
+    doubt: Floats | None = None
+    """What odometry may have erred since each row, (m, 2), in m and rad; `place` fills it in."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A robot's pose (3,) by clues, its covariance (3, 3) from them alone, and its derivative (3, 3) by each anchor."""
+
+    pose: Floats
+    covariance: Floats
+    by: dict[int, Floats]
+
+
+def place(clues: Clues, now: Floats) -> Placed | None:
+    """Return where a robot is whose odometry has it at ``now`` (3,) in its own frame; None where clues do not say."""
+    told = np.count_nonzero(np.isfinite(clues.range_m)) + np.count_nonzero(np.isfinite(clues.bearing_rad))
+    if told < 4:
+        return None
+    best: list[tuple[float, Floats]] = []
+    clues = replace(clues, doubt=_doubt(clues, now))
+    for start in _starts(clues):
+        found = _settle(clues, start)
+        best.append((float(np.sum(np.minimum(_residuals(clues, found)[0] ** 2, LIMIT**2))), found))
+    best.sort(key=lambda pair: pair[0])
+    cost, found = best[0]
+    residual, by, by_other = _residuals(clues, found)
+    kept = np.abs(residual) < LIMIT
+    if np.count_nonzero(kept) < max(4, AGREEING * len(residual)):
+        return None
+    information = by[kept].T @ by[kept]
+    if not np.linalg.cond(information) < 1e12:
+        return None
+    covariance = np.linalg.inv(information)
+    for other_cost, other in best[1:]:
+        apart = _at(other, now) - _at(found, now)
+        apart[2] -= 2 * np.pi * np.round(apart[2] / (2 * np.pi))
+        if other_cost - cost < RIVALS and np.any(np.abs(apart) > [0.5, 0.5, 0.5]):
+            return None
+    cos, sin = np.cos(found[2]), np.sin(found[2])
+    turn = np.eye(3)
+    turn[:2, 2] = [-sin * now[0] - cos * now[1], cos * now[0] - sin * now[1]]
+    spread = turn @ covariance @ turn.T
+    if np.sqrt(max(spread[0, 0], spread[1, 1])) > PLACED_SD[0] or np.sqrt(spread[2, 2]) > PLACED_SD[1]:
+        return None
+    gain = -turn @ covariance @ by[kept].T
+    whose = np.concatenate([clues.anchor, clues.anchor])[_told(clues)][kept]
+    moved = {who: gain @ (by_other[kept] * (whose == who)[:, None]) for who in np.unique(whose[whose >= 0]).tolist()}
+    return Placed(_at(found, now), spread, moved)
+
+
+def _doubt(clues: Clues, now: Floats) -> Floats:
+    way = np.hypot(*(clues.own[:, :2] - now[:2]).T)
+    turned = np.abs(clues.own[:, 2] - now[2])
+    return np.column_stack([WAY_SD * way + TURN_SD * turned * way / 2, TURN_SD * turned])
+
+
+def _told(clues: Clues) -> NDArray[np.bool_]:
+    """Which of all ranges, then all bearings, were measured."""
+    return np.concatenate([np.isfinite(clues.range_m), np.isfinite(clues.bearing_rad)])
+
+
+def _at(frame: Floats, own: Floats) -> Floats:
+    """Bring a pose of the robot's own frame into the site's."""
+    cos, sin = np.cos(frame[2]), np.sin(frame[2])
+    return np.array([frame[0] + cos * own[0] - sin * own[1], frame[1] + sin * own[0] + cos * own[1], frame[2] + own[2]])
+
+
+def _starts(clues: Clues) -> list[Floats]:
+    """Frames to begin with: for each heading where ranges with directions say, else round the other ends."""
+    directed = np.isfinite(clues.range_m) & np.isfinite(clues.bearing_rad) & ~clues.compass
+    heard = ~clues.compass
+    out: list[Floats] = []
+    for heading in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+        yaw = heading + clues.own[:, 2]
+        cos, sin = np.cos(heading), np.sin(heading)
+        from_own = np.column_stack([cos * clues.own[:, 0] - sin * clues.own[:, 1], sin * clues.own[:, 0] + cos * clues.own[:, 1]])
+        if directed.any():
+            toward = np.where(clues.listens, yaw + clues.bearing_rad, clues.other[:, 2] + clues.bearing_rad + np.pi)
+            there = clues.other[:, :2] - clues.range_m[:, None] * np.column_stack([np.cos(toward), np.sin(toward)])
+            out.append(np.array([*np.median((there - from_own)[directed], axis=0), heading]))
+        elif heard.any():
+            middle = np.mean(clues.other[heard, :2] - from_own[heard], axis=0)
+            reach = float(np.nanmedian(clues.range_m)) if np.isfinite(clues.range_m).any() else 1.0
+            out += [np.array([*(middle + reach * np.array(side)), heading]) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    return out
+
+
+def _settle(clues: Clues, frame: Floats) -> Floats:
+    for _ in range(STEPS):
+        residual, by, _ = _residuals(clues, frame)
+        weight = 1.0 / (1.0 + (residual / LIMIT) ** 2) ** 2  # Geman and McClure 1987
+        normal = by.T @ (weight[:, None] * by) + 1e-6 * np.eye(3)
+        step = -np.linalg.solve(normal, by.T @ (weight * residual))
+        step[:2] *= min(1.0, 2.0 / max(np.hypot(*step[:2]), 1e-9))
+        step[2] = np.clip(step[2], -0.5, 0.5)
+        frame = frame + step
+        if np.max(np.abs(step)) < 1e-6:
+            break
+    return frame
+
+
+def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
+    """Whitened misses (k,) of ranges, then bearings, and their derivatives (k, 3) by the frame and by the other end."""
+    cos, sin = np.cos(frame[2]), np.sin(frame[2])
+    ox, oy = clues.own[:, 0], clues.own[:, 1]
+    yaw = frame[2] + clues.own[:, 2]
+    ax = np.cos(yaw) * clues.arm[:, 0] - np.sin(yaw) * clues.arm[:, 1]
+    ay = np.sin(yaw) * clues.arm[:, 0] + np.cos(yaw) * clues.arm[:, 1]
+    from_x, from_y = cos * ox - sin * oy + ax, sin * ox + cos * oy + ay
+    dx, dy = clues.other[:, 0] - frame[0] - from_x, clues.other[:, 1] - frame[1] - from_y
+    flat = np.maximum(dx**2 + dy**2, 1e-6)
+    r = np.sqrt(flat + clues.arm[:, 2] ** 2)
+    m = len(r)
+    doubt = np.zeros((m, 2)) if clues.doubt is None else clues.doubt
+    range_sd = np.sqrt(BEGIN_SD_M**2 + (SCALE_SD * np.nan_to_num(clues.range_m)) ** 2 + doubt[:, 0] ** 2)
+    by_place = np.column_stack([-dx / r, -dy / r])  # of r, by the robot's place
+    range_by = np.column_stack([by_place, -by_place[:, 0] * from_y + by_place[:, 1] * from_x])
+    range_other = np.column_stack([-by_place, np.zeros(m)])
+    direction = np.where(clues.listens, np.arctan2(dy, dx), np.arctan2(-dy, -dx))
+    about = np.where(clues.listens, yaw, clues.other[:, 2])
+    bearing_place = np.column_stack([dy / flat, -dx / flat])  # the same for both ways round
+    bearing_by = np.column_stack(
+        [bearing_place, -bearing_place[:, 0] * from_y + bearing_place[:, 1] * from_x - clues.listens]
+    )
+    bearing_other = np.column_stack([-bearing_place, -1.0 * ~clues.listens])
+    off = direction - about - clues.bearing_rad
+    if clues.compass.any():
+        c = clues.compass
+        off[c] = (yaw - clues.bearing_rad)[c]
+        bearing_by[c] = [0.0, 0.0, 1.0]
+        bearing_other[c] = 0.0
+    off = off - 2 * np.pi * np.round(off / (2 * np.pi))
+    bearing_sd = np.hypot(np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD), doubt[:, 1] + doubt[:, 0] / np.sqrt(flat))
+    told = _told(clues)
+    residual = np.concatenate([(r - clues.range_m) / range_sd, off / bearing_sd])
+    by = np.vstack([range_by / range_sd[:, None], bearing_by / bearing_sd[:, None]])
+    other = np.vstack([range_other / range_sd[:, None], bearing_other / bearing_sd[:, None]])
+    return residual[told], by[told], other[told]

@@ -1,0 +1,360 @@
+"""The team afterwards: every instant of every robot by all that was heard before it and after.
+
+Passes over the whole recording, each linearised about the track of the one before: Gauss–Newton on the joint problem
+(Bell, SIAM J. Optim. 4(3), 1994). A pass runs the filter forward and a modified Bryson–Frazier smoother back (Bierman,
+IEEE Trans. AC 18, 1973), which inverts nothing. Measurements are judged anew by what each pass leaves of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from sonofix.records import Floats
+from sonofix.team.feed import COMPASS, Feed
+from sonofix.team.fleet import SLIPPED, Belief, Moment
+from sonofix.team.hear import REFUSED, crowd, spread
+from sonofix.team.kernel import advance, drive, expect, turned_by
+from sonofix.team.noise import BODY_M, MOST_SHARE, Noise, beyond, repeated, scatter, staying
+from sonofix.team.state import POSE, SIZE, YAW, prior, prior_sd, wander_psd
+from sonofix.track.kernel import absorb
+from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
+
+PASSES = 4
+
+OPEN_SD = (10.0, 10.0, np.pi)
+"""Of a pose of which nothing is known but the track so far, in m and rad."""
+
+MEMORY_BYTES = 4e9
+"""More than this is not asked for."""
+
+
+def smooth(
+    feed: Feed,
+    moments: Sequence[Moment],
+    belief: Belief,
+    means: Floats,
+    passes: int = PASSES,
+    on_moment: Callable[[], None] = lambda: None,
+) -> list[Moment]:
+    """Smooth a run of the joint filter.
+
+    Parameters
+    ----------
+    feed : Feed
+    moments : sequence of Moment, as `fleet.follow` gave them
+    belief : Belief
+        The filter's last: its noise is what all of the recording taught.
+    means : float64 (moments, SIZE V)
+        The filter's means at each moment.
+    passes : int
+    on_moment : callable
+        Is called for each moment of each pass.
+
+    Returns
+    -------
+    list of Moment; robots have a place from their odometry's first row on
+
+    Raises
+    ------
+    ValueError
+        If the recording is too long to be held.
+    """
+    count, n = means.shape
+    needed = 8.0 * count * n * n
+    if needed > MEMORY_BYTES:
+        raise ValueError(f"{count} moments of {n} states take {needed / 1e9:.1f} GB to smooth; cut the recording in parts")
+    active, opened = _spans(feed, moments)
+    nominal = _whole(feed, moments, means, active)
+    variance, taken = _variances(feed, belief.noise)
+    judged = None
+    for number in range(passes):
+        smoothed, blocks, used = _pass(feed, moments, nominal, active, opened, taken, judged, on_moment)
+        nominal = smoothed
+        judged = _judge(feed, moments, nominal, active, variance)
+    speed = np.zeros(len(feed.robots))
+    out = []
+    for k, moment in enumerate(moments):
+        pose = nominal[k].reshape(-1, SIZE)[:, :POSE]
+        rows = slice(*moment.rows)
+        speed = moment.speed_mps
+        out.append(replace(moment, pose=pose.copy(), covariance=blocks[k], placed=active[k].copy(), used=used[rows], speed_mps=speed))
+    return out
+
+
+def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Floats]:
+    """Return which robots take part at each moment (k, V), and variances (k, V, POSE) by which their poses open then."""
+    robots = len(feed.robots)
+    placed = np.array([moment.placed for moment in moments])
+    active, opened = placed.copy(), np.zeros((len(moments), robots, POSE))
+    times = np.array([moment.time_s for moment in moments])
+    for r in range(robots):
+        told = feed.odometry_s[feed.first[r] : feed.first[r + 1]]
+        at = np.flatnonzero(placed[:, r])
+        if not len(at) or not len(told):
+            active[:, r] = False
+            continue
+        begin = min(int(np.searchsorted(times, told[0])), int(at[0]))
+        active[begin : at[0], r] = True
+        opened[begin, r] = np.square(OPEN_SD)
+        again = at[1:][np.diff(at) > 1]
+        opened[again, r] = np.square(OPEN_SD)
+    index = {name: r for r, name in enumerate(feed.robots)}
+    for k, moment in enumerate(moments):
+        for event in moment.events:
+            if event.event == "slip":
+                opened[k, index[event.vehicle]] += np.square(SLIPPED)
+    return active, opened
+
+
+def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray[np.bool_]) -> Floats:
+    """Return means that reach back to each robot's first odometry: before it was placed, its odometry run backwards."""
+    nominal = means.copy()
+    pose, by, stray = np.empty(POSE), np.empty((POSE, SIZE)), np.empty(3)
+    times = [moment.time_s for moment in moments]
+    for r in range(len(feed.robots)):
+        own = slice(SIZE * r, SIZE * (r + 1))
+        a, b = feed.first[r], feed.first[r + 1]
+        placed = [k for k, moment in enumerate(moments) if moment.placed[r]]
+        if not placed:
+            continue
+        for k in range(placed[0] - 1, -1, -1):
+            nominal[k, own] = nominal[k + 1, own]
+            if not active[k, r]:
+                continue
+            origin = np.concatenate([np.zeros(POSE), nominal[k + 1, own][POSE:]])
+            drive(origin, feed.odometry_s[a:b], feed.odometry[a:b], times[k], times[k + 1], pose, by, stray)
+            yaw = nominal[k + 1, own][YAW] - pose[2]
+            cos, sin = np.cos(yaw), np.sin(yaw)
+            back = np.array([cos * pose[0] - sin * pose[1], sin * pose[0] + cos * pose[1]])
+            nominal[k, own][:2] = nominal[k + 1, own][:2] - back
+            nominal[k, own][YAW] = yaw
+    return nominal
+
+
+def _variances(feed: Feed, noise: Noise) -> tuple[Floats, Floats]:
+    """Return the variances (rows, 2) of single ranges and bearings, and those to be taken as they come again and again."""
+    rows = len(feed.time_s)
+    out, taken = np.full((rows, 2), np.nan), np.full((rows, 2), np.nan)
+    last = np.full(feed.pairs, np.nan)
+    many = np.ones(rows)
+    edges = np.flatnonzero(np.diff(feed.time_s, prepend=-np.inf) > 0)
+    for a, b in zip(edges, [*edges[1:], rows], strict=True):
+        many[a:b] = crowd((int(a), int(b)), feed.listener, feed.range_m)
+    stays = staying(noise.share)
+    for i in range(rows):
+        if feed.kind[i] == COMPASS:
+            out[i, 1] = taken[i, 1] = COMPASS_SD_RAD**2
+            continue
+        pair, who = feed.pair[i], int(feed.listener[i])
+        since = feed.time_s[i] - last[pair]
+        last[pair] = feed.time_s[i]
+        listener = who if who >= 0 else len(feed.robots)
+        stated = feed.range_sd_m[i] ** 2 if np.isfinite(feed.range_sd_m[i]) else 0.0
+        out[i, 0] = taken[i, 0] = stated
+        if not noise.believed:
+            out[i, 0] = stated + beyond(noise.ranges, listener, feed.range_m[i])
+            taken[i, 0] = out[i, 0] * repeated(stays, since) * many[i]
+        white = scatter(noise.bearings, listener)
+        body = (BODY_M / max(feed.range_m[i] if np.isfinite(feed.range_m[i]) else 1.0, BODY_M)) ** 2
+        out[i, 1], taken[i, 1] = white + body, white + body * repeated(MOST_SHARE, since)
+    return out, taken
+
+
+def _pass(
+    feed: Feed,
+    moments: Sequence[Moment],
+    nominal: Floats,
+    active: NDArray[np.bool_],
+    opened: Floats,
+    taken: Floats,
+    judged: Floats | None,
+    on_moment: Callable[[], None],
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Run forward and back about a track; return the smoothed means, pose covariances and what was used."""
+    count, n = nominal.shape
+    robots = len(feed.robots)
+    mean = nominal[0].copy()
+    sd = np.tile(prior_sd(feed.own_ranges), robots)
+    covariance = np.diag(sd**2)
+    for r in range(robots):
+        mean[SIZE * r + POSE : SIZE * (r + 1)] = prior()[POSE:]
+        covariance[SIZE * r : SIZE * r + POSE] = 0.0
+    psd = wander_psd(feed.own_ranges)
+    bys, drive_noise, speed = np.zeros((count, robots, POSE, SIZE)), np.zeros((robots, POSE, POSE)), np.zeros(robots)
+    means, covariances = np.empty((count, n)), np.empty((count, n, n))
+    kept, gains = np.zeros((2 * len(feed.time_s), n)), np.zeros((2 * len(feed.time_s), n))
+    totals, misses = np.zeros(2 * len(feed.time_s)), np.zeros(2 * len(feed.time_s))
+    ends = np.zeros(count + 1, np.int64)
+    used = np.zeros((len(feed.time_s), 2), bool)
+    weights = np.ones((len(feed.time_s), 2)) if judged is None else judged
+    work = np.empty((3, n))
+    for k, moment in enumerate(moments):
+        if k:
+            last = moments[k - 1].time_s
+            advance(
+                mean, covariance, nominal[k - 1], active[k], feed.first, feed.odometry_s, feed.odometry, last,
+                moment.time_s, psd, bys[k], drive_noise, speed,
+            )  # fmt: skip
+        for r in np.flatnonzero(active[k]).tolist():
+            if opened[k, r].any():
+                at = np.arange(SIZE * r, SIZE * r + POSE)
+                if k == 0 or not active[k - 1, r]:
+                    mean[at] = nominal[k, at]
+                    covariance[at, :] = covariance[:, at] = 0.0
+                    bys[k, r][:] = 0.0
+                covariance[at, at] += opened[k, r]
+        ends[k + 1] = _hear(
+            mean, covariance, nominal[k], active[k], moment.rows, feed.kind, feed.listener, feed.source,
+            feed.listener_point, feed.source_point, feed.range_m, feed.bearing_rad, taken, weights, judged is None,
+            1.0 / feed.sound_speed_mps, speed, used, kept, gains, totals, misses, int(ends[k]), work,
+        )  # fmt: skip
+        means[k], covariances[k] = mean, covariance
+        on_moment()
+    smoothed, blocks = np.empty((count, n)), np.empty((count, robots, POSE, POSE))
+    _back(means, covariances, bys, active, kept, gains, totals, misses, ends, smoothed, blocks)
+    for k in range(count):
+        for r in np.flatnonzero(~active[k]).tolist():
+            smoothed[k, SIZE * r : SIZE * (r + 1)] = nominal[k, SIZE * r : SIZE * (r + 1)]
+    return smoothed, blocks, used
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _hear(
+    mean, covariance, about, active, rows, kind, listener, source, listener_point, source_point, range_m, bearing_rad,
+    taken, weights, gate, flight_s_per_m, speed, used, kept, gains, totals, misses, end, work,
+):  # fmt: skip
+    """Take rows in, linearised about a track, and keep what the way back needs; return where that ends."""
+    n = len(mean)
+    row = np.empty((2, n))
+    for i in range(rows[0], rows[1]):
+        a, b = listener[i], source[i]
+        if (a >= 0 and not active[a]) or (b >= 0 and not active[b]):
+            continue
+        shown = direction = 0.0
+        if kind[i] == COMPASS:
+            row[1, :] = 0.0
+            row[1, SIZE * a + YAW] = 1.0
+            direction = about[SIZE * a + YAW]
+        else:
+            shown, direction, _ = expect(about, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+        for j in (1, 0):
+            measured = bearing_rad[i] if j == 1 else range_m[i]
+            used[i, j] = False
+            if not np.isfinite(measured) or (j == 1 and a < 0) or not weights[i, j] > 0.0:
+                continue
+            miss = turned_by(measured - direction) if j == 1 else measured - shown
+            for m in range(n):
+                if row[j, m] != 0.0:
+                    miss -= row[j, m] * (mean[m] - about[m])
+            variance = taken[i, j] / weights[i, j]
+            total = spread(covariance, row[j]) + variance
+            if gate and miss * miss > REFUSED * total:
+                continue
+            absorb(mean, covariance, row[j], miss, variance, work)
+            kept[end], gains[end], totals[end], misses[end] = row[j], work[1], total, miss
+            used[i, j] = True
+            end += 1
+    return end
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _back(means, covariances, bys, active, kept, gains, totals, misses, ends, smoothed, blocks):
+    """Smooth backwards: x − P λ and P − P Λ P, with λ and Λ carried back over measurements and drives."""
+    count, n = means.shape
+    robots = active.shape[1]
+    adjoint, information = np.zeros(n), np.zeros((n, n))
+    told = np.empty(n)
+    carried = np.empty((3, n))
+    for k in range(count - 1, -1, -1):
+        for i in range(n):
+            value = means[k, i]
+            for j in range(n):
+                value -= covariances[k, i, j] * adjoint[j]
+            smoothed[k, i] = value
+        for r in range(robots):
+            at = SIZE * r
+            rows = covariances[k, at : at + POSE]
+            less = rows @ information @ rows.T
+            blocks[k, r] = covariances[k, at : at + POSE, at : at + POSE] - 0.5 * (less + less.T)
+        for m in range(ends[k + 1] - 1, ends[k] - 1, -1):
+            row, gain = kept[m], gains[m]
+            # (I − k hᵀ)ᵀ Λ (I − k hᵀ) + h hᵀ / s, and (I − k hᵀ)ᵀ λ − h y / s
+            along = 0.0
+            for i in range(n):
+                value = 0.0
+                for j in range(n):
+                    value += information[i, j] * gain[j]
+                told[i] = value
+                along += value * gain[i]
+            pull = 0.0
+            for i in range(n):
+                pull += gain[i] * adjoint[i]
+            for i in range(n):
+                adjoint[i] -= row[i] * (pull + misses[m] / totals[m])
+                for j in range(n):
+                    information[i, j] += row[i] * row[j] * (along + 1.0 / totals[m]) - row[i] * told[j] - told[i] * row[j]
+        if k == 0:
+            break
+        for r in range(robots):
+            if not active[k, r]:
+                continue
+            at = SIZE * r
+            by = bys[k, r]
+            # Fᵀ λ, Fᵀ Λ F: columns of the pose spread to all of the robot's states
+            for i in range(3):
+                told[i] = adjoint[at + i]
+            for i in range(3):
+                adjoint[at + i] = 0.0
+            for i in range(3):
+                for j in range(SIZE):
+                    adjoint[at + j] += by[i, j] * told[i]
+            for i in range(3):
+                for m in range(n):
+                    carried[i, m] = information[at + i, m]
+                    information[at + i, m] = 0.0
+            for i in range(3):
+                for j in range(SIZE):
+                    for m in range(n):
+                        information[at + j, m] += by[i, j] * carried[i, m]
+            for i in range(3):
+                for m in range(n):
+                    carried[i, m] = information[m, at + i]
+                    information[m, at + i] = 0.0
+            for i in range(3):
+                for j in range(SIZE):
+                    for m in range(n):
+                        information[m, at + j] += by[i, j] * carried[i, m]
+
+
+def _judge(
+    feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArray[np.bool_], variance: Floats
+) -> Floats:
+    """Return weights (rows, 2) of what a track leaves of each measurement; 0: not believed (Huber 1964, and a limit)."""
+    weights = np.zeros((len(feed.time_s), 2))
+    row = np.empty((2, nominal.shape[1]))
+    speed = np.zeros(len(feed.robots))
+    for k, moment in enumerate(moments):
+        for i in range(*moment.rows):
+            a, b = int(feed.listener[i]), int(feed.source[i])
+            if (a >= 0 and not active[k, a]) or (b >= 0 and not active[k, b]):
+                continue
+            if feed.kind[i] == COMPASS:
+                left = np.array([np.nan, turned_by(feed.bearing_rad[i] - nominal[k, SIZE * a + YAW])])
+            else:
+                shown, direction, _ = expect(
+                    nominal[k], a, b, feed.listener_point[i], feed.source_point[i], 1.0 / feed.sound_speed_mps, speed, row
+                )
+                left = np.array([feed.range_m[i] - shown, turned_by(feed.bearing_rad[i] - direction)])
+            off = np.abs(left) / np.sqrt(variance[i])
+            weight = np.where(off < np.sqrt(REFUSED), np.minimum(1.0, ROBUST / np.maximum(off, 1e-9)), 0.0)
+            if feed.kind[i] == COMPASS:
+                weight = np.minimum(1.0, ROBUST / np.maximum(off, 1e-9))
+            elif weight[1] == 0.0 and np.isfinite(left[1]):
+                weight[:] = 0.0
+            weights[i] = np.nan_to_num(weight)
+    return weights

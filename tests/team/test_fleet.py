@@ -1,0 +1,152 @@
+import numpy as np
+import pytest
+from team.made_fleet import errors, fleet, nees
+
+from sonofix.team.apart import follow_apart
+from sonofix.team.feed import gather, heard_by
+from sonofix.team.fleet import follow
+from sonofix.team.message import BYTES, Message, unpack
+from sonofix.team.smooth import smooth
+from sonofix.team.tell import steps_of
+
+
+def run(recording, **options):
+    moments, belief = [], None
+    for moment, belief in follow(gather(recording), **options):  # noqa: B007
+        moments.append(moment)
+    return moments, belief
+
+
+def test_robots_find_themselves_without_a_start():
+    recording, truth = fleet(seconds=40)
+    moments, _ = run(recording)
+    error, _ = errors(moments, truth, after_s=15)
+    assert moments[-1].placed.all()
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.1
+    assert [e.event for m in moments for e in m.events].count("joined") == 3
+
+
+def test_turning_and_shifting_the_world_turns_and_shifts_the_tracks():
+    turned, shift = 1.1, (30.0, -12.0)
+    here, _ = run(fleet(seconds=25, seed=3)[0])
+    there, _ = run(fleet(seconds=25, seed=3, turned_rad=turned, shift_m=shift)[0])
+    cos, sin = np.cos(turned), np.sin(turned)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    # the robots' places are found by trying directions of the frame, so they agree once they are settled
+    for a, b in list(zip(here, there, strict=True))[-10:]:
+        np.testing.assert_allclose(a.pose[:, :2] @ turn.T + shift, b.pose[:, :2], atol=0.03)
+
+
+def test_one_that_hears_landmarks_carries_the_others():
+    recording, truth = fleet(seconds=80, hears=(0,), seed=1)
+    moments, _ = run(recording)
+    error, _ = errors(moments, truth, after_s=30)
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.3
+    assert moments[-1].placed.all()
+
+
+def test_smoothing_is_better_and_reaches_back():
+    recording, truth = fleet(seconds=40, seed=2)
+    feed = gather(recording)
+    moments, means = [], []
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    after = smooth(feed, moments, belief, np.array(means))
+    causal, smoothed = (errors(m, truth)[0] for m in (moments, after))
+    assert np.mean(smoothed**2) < 0.6 * np.mean(causal**2)
+    assert after[0].placed.all()
+    assert nees(*errors(after, truth)) < 4.0
+
+
+def test_a_push_is_found():
+    recording, truth = fleet(seconds=40, seed=4, pushed=(1, 25.0, 0.8))
+    moments, _ = run(recording)
+    events = [e for m in moments for e in m.events if e.event == "slip"]
+    assert events
+    assert events[0].vehicle == "R1"
+    assert 25.0 <= events[0].time_s < 27.0
+    error, _ = errors(moments, truth, after_s=30)
+    assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.12
+
+
+def test_a_robot_that_falls_silent_leaves_and_joins_again():
+    recording, _ = fleet(seconds=60, seed=5, silent={2: (20.0, 40.0)})
+    moments, _ = run(recording)
+    told = [(e.event, round(e.time_s)) for m in moments for e in m.events if e.vehicle == "R2"]
+    assert [event for event, _ in told] == ["joined", "left", "joined"]
+    assert 29 <= told[1][1] <= 32
+    assert told[2][1] >= 40
+
+
+def test_odometry_alone_is_never_better():
+    recording, truth = fleet(seconds=60, seed=6)
+    alone, _ = run(recording, until_placed=True)
+    helped, _ = run(recording)
+    late = [np.mean(errors(m, truth, after_s=40)[0] ** 2) for m in (alone, helped)]
+    assert late[0] > 10 * late[1]
+    assert not np.concatenate([m.used for m in alone]).any()
+
+
+def test_those_who_hear_no_landmarks_have_none():
+    feed = heard_by(gather(fleet(seconds=5)[0]), ["R1"])
+    fixed = feed.source < 0
+    assert fixed.any()
+    assert set(feed.listener[fixed].tolist()) == {1}
+    assert not (heard_by(gather(fleet(seconds=5)[0]), peers=False).source >= 0).any()
+
+
+def test_steps_hold_what_was_heard_and_used():
+    recording, _ = fleet(seconds=10)
+    feed = gather(recording)
+    steps = list(steps_of(feed, (m for m, _ in follow(feed))))
+    assert sum(len(step.ranges) for step in steps) == len(feed.time_s)
+    assert sum(step.range_used.sum() for step in steps) > 0.5 * len(feed.time_s)
+    assert steps[-1].estimates[0].states == ("x", "y", "yaw")
+
+
+def test_centralised_deviations_are_right():
+    ratios = []
+    for seed in range(6):
+        recording, truth = fleet(seconds=60, seed=100 + seed, silent={1: (25.0, 40.0)})
+        moments, _ = run(recording)
+        ratios.append(nees(*errors(moments, truth, after_s=10)))
+    # 2 where they are right; errors of one run are alike over seconds, so six runs tell it to about a third
+    assert 0.3 < np.mean(ratios) < 2.7
+
+
+def test_decentralised_is_never_overconfident_nor_surer_than_all_at_once():
+    ratios, wider = [], []
+    for seed in range(4):
+        recording, truth = fleet(seconds=40, seed=200 + seed, hears=(0, 1), silent={1: (18.0, 30.0)})
+        feed = gather(recording)
+        apart = [moment for moment, _ in follow_apart(feed)]
+        together = [moment for moment, _ in follow(feed)]
+        ratios.append(nees(*errors(apart, truth, after_s=10)))
+        both = [(a, b) for a, b in zip(apart, together, strict=True) if a.placed.all() and b.placed.all()]
+        wider += [a.covariance[2, :2, :2].trace() / b.covariance[2, :2, :2].trace() for a, b in both]
+    assert np.mean(ratios) < 2.7
+    # noise is learnt apart, so now and then one is a little surer
+    assert np.median(wider) > 1.0
+
+
+def test_messages_come_through_and_are_small():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    sent = Message(3, 12.5, rng.normal(size=6), root @ root.T, 0.5 * root @ root.T, np.array([1.0, 0.2, 0.01, 1e-4]))
+    packet = sent.pack()
+    assert len(packet) == BYTES < 256
+    got = unpack(packet)
+    assert (got.sender, got.time_s) == (3, 12.5)
+    np.testing.assert_allclose(got.mean, sent.mean, rtol=1e-6)
+    np.testing.assert_allclose(got.covariance, sent.covariance, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(got.mean[:3], sent.mean[:3])
+
+
+def test_a_recording_without_odometry_says_so():
+    recording, _ = fleet(seconds=5)
+    tables = {name: table for name, table in recording.tables.items() if name != "odometry"}
+    from dataclasses import replace
+
+    with pytest.raises(ValueError, match=r"odometry\.csv"):
+        gather(replace(recording, tables=tables))
