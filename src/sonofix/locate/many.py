@@ -128,14 +128,14 @@ def fix_many(
     bounds = np.array([[-np.inf] * 3, [np.inf] * 3] if bounds_m is None else bounds_m, float)
     if bounds.shape != (2, 3) or not np.all(bounds[0] <= bounds[1]):
         raise ValueError(f"bounds_m {bounds_m}: give two corners of the room, the lower first: [[x, y, z], [x, y, z]]")
-    flat, n = level_m is not None, len(ranges)
+    flat, clock, n = level_m is not None, bool(clock), len(ranges)
     places = [0, 1] + [2] * (not flat)
     index = np.array(places + [3] * clock)
     degrees = np.arange(len(anchors) + 1) - len(index)
     limits = np.array([[threshold(int(d), rate) for d in degrees] for rate in (FALSE_ALARM, MENDED)])
     status, state, chi2 = np.zeros(n, np.int8), np.full((n, 4), np.nan), np.full(n, np.nan)
     spreads, used = np.full((n, len(index), len(index)), np.nan), np.zeros((n, len(anchors)), bool)
-    known = (flat, float(level_m or 0.0), bool(clock), index)
+    known = (flat, float(level_m or 0.0), clock, index)
     judge = (limits, AMBIGUOUS_CHI2, bounds_m is not None, bounds)
     bad = solve_all(anchors, ranges, covariance, each, known, judge, status, state, spreads, chi2, used)
     if bad >= 0:
