@@ -27,7 +27,11 @@ KINDS = 2
 """Errors of each pair: slow, quick."""
 
 BEGIN_SD_M = 0.1
-"""Of slow errors, of quick ones and of noise beyond what is stated, each, before ranges have told."""
+"""Of slow errors and of quick ones, each, before ranges have told."""
+
+NOISE_SD_M = 1.0
+"""Of noise beyond what is stated, before ranges have told: what is taken for surer than it is in the first seconds, a
+scale or bias does not forget."""
 
 CORRELATED_S = np.array([3000.0, 2.0])
 """Of slow errors (antennas, walls) and of quick ones (multipath along the way)."""
@@ -79,7 +83,7 @@ class Trust:
 
     def extra(self, pair: NDArray[np.int64]) -> Floats:
         """Variance (n,) in m² that rows of some pairs have beyond what they state."""
-        every = (self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
+        every = (self.square[-1] - self.stated[-1] + POOL * NOISE_SD_M**2) / (self.count[-1] + POOL)
         beyond = self.square[pair] - self.stated[pair] + POOL * every
         return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
 
@@ -164,8 +168,12 @@ def show(
 
 
 def heavier(surprise: Floats) -> Floats:
-    """Return the factor on a row's variance that Student's t asks for, by its squared innovation over its variance."""
-    return np.maximum((FREEDOM + surprise) / (FREEDOM + 1.0), 1.0)
+    """Return the factor on a row's variance that Student's t asks for, by its squared innovation over its variance.
+
+    Noise of known weights (ν + 1) / (ν + z²) would tell (ν + 3) / (ν + 1) times what such a row tells (Fisher's
+    information of t about its place: Lange, Little and Taylor 1989), so it is larger by that.
+    """
+    return (FREEDOM + 3.0) / (FREEDOM + 1.0) * (FREEDOM + surprise) / (FREEDOM + 1.0)
 
 
 def log_likelihood(surprise: Floats, variance: Floats) -> float:
