@@ -12,6 +12,7 @@ from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
+from sonofix.track import stated
 from sonofix.track.bank import Bank
 from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
 from sonofix.track.course import Course
@@ -75,6 +76,20 @@ class Follower:
         if inputs is not None and inputs.range_slot >= 0:
             wheeled = np.flatnonzero(inputs.wheel_slot >= 0).tolist()
             self._banks = {who: Bank(self.belief, who) for who in wheeled}
+
+    def knowing(self, other: Follower) -> Follower:
+        """Return this follower, at its beginning, with what another has learnt of the same recording by its end.
+
+        That is how agile vehicles are, how far odometry may be trusted and how ranges err: sizes, not values.
+        """
+        trust, inputs = other.belief.trust, self.belief.inputs
+        if trust is None or inputs is None:
+            return self
+        covariance = self.belief.covariance.copy()
+        stated.open_pairs(covariance, inputs.range_slot, trust)
+        self.belief = replace(self.belief, covariance=covariance, trust=trust, rough=other.belief.rough)
+        self.motion, self._banks = other.motion, {}
+        return self
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
         """Place a vehicle at a pose known beforehand."""

@@ -27,11 +27,7 @@ KINDS = 2
 """Errors of each pair: slow, quick."""
 
 BEGIN_SD_M = 0.1
-"""Of slow errors and of quick ones, each, before ranges have told."""
-
-NOISE_SD_M = 1.0
-"""Of noise beyond what is stated, before ranges have told: what is taken for surer than it is in the first seconds, a
-scale or bias does not forget."""
+"""Of slow errors, of quick ones and of noise beyond what is stated, each, before ranges have told."""
 
 CORRELATED_S = np.array([3000.0, 2.0])
 """Of slow errors (antennas, walls) and of quick ones (multipath along the way)."""
@@ -83,7 +79,7 @@ class Trust:
 
     def extra(self, pair: NDArray[np.int64]) -> Floats:
         """Variance (n,) in m² that rows of some pairs have beyond what they state."""
-        every = (self.square[-1] - self.stated[-1] + POOL * NOISE_SD_M**2) / (self.count[-1] + POOL)
+        every = (self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
         beyond = self.square[pair] - self.stated[pair] + POOL * every
         return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
 
@@ -138,6 +134,12 @@ def begin(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, 
     variances = np.concatenate([[SCALE_SD**2, BIAS_SD_M**2], np.full(KINDS * pairs, BEGIN_SD_M**2)])
     covariance[own, own] = np.diag(variances)
     free[own] = True
+
+
+def open_pairs(covariance: Floats, slot: int, known: Trust) -> None:
+    """Give the errors of pairs the variances that are known of them, in place: before anything was heard."""
+    at = np.arange(slot + COMMON, slot + COMMON + known.own.size)
+    covariance[at, at] = known.variance.ravel()
 
 
 def wander(mean: Floats, covariance: Floats, slot: int, known: Trust, dt: float) -> None:
