@@ -52,6 +52,7 @@ def drive(mean, covariance, factor, arc, doubt, constants):
         bent = np.sin(half) / half if abs(half) > 1e-9 else 1.0
         middle = x[2] + half
         cos, sin = np.cos(middle), np.sin(middle)
+        bent *= np.exp(-p[2, 2] / 2)
         chord = way * (1.0 - x[3]) * bent
         x[0] += chord * cos
         x[1] += chord * sin

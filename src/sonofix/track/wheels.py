@@ -97,7 +97,10 @@ def take(
     at = SIZE * vehicle
     way, turn, dt, unseen = arc
     if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and dt <= LONGEST_S:
-        about = mean if about is None else about
+        if about is None:
+            # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
+            way *= float(np.exp(-covariance[slot + 2, slot + 2] / 2))
+            about = mean
         miss, derivative, noise = measure(about, vehicle, slot, (way, turn, dt), arm, rough)
         correct(mean, covariance, miss - derivative @ (mean - about), derivative, noise, UNLIKELY)
     if free[at + 3]:
