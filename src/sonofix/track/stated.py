@@ -198,6 +198,8 @@ def wander(mean: Floats, covariance: Floats, slot: int, known: Trust, dt: float)
     covariance[:, own] *= fade
     at = np.arange(own.start, own.stop)
     covariance[at, at] += known.variance.ravel() * (1.0 - fade**2)
+    # where pairs err by more than was expected, so may what they share
+    covariance[slot + 1, slot + 1] += max(known.pool[0] - BIAS_SD_M**2, 0.0) * (1.0 - fade[0] ** 2)
 
 
 def places(slot: int, pair: NDArray[np.int64], pairs: int) -> NDArray[np.int64]:
