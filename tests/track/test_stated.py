@@ -126,8 +126,8 @@ def test_the_tail_of_noise_weighs_less_and_less() -> None:
     pull = np.sqrt(surprise) / factor
     assert np.argmax(pull) < 45
     # the factor is that of the t density's score: d/dz log p = -z (ν + 1) / (ν + z²)
-    beyond = surprise > 1.0
-    assert factor[beyond] == pytest.approx((stated.FREEDOM + surprise[beyond]) / (stated.FREEDOM + 1.0))
+    fisher = (stated.FREEDOM + 1.0) / (stated.FREEDOM + 3.0)
+    assert fisher * factor == pytest.approx((stated.FREEDOM + surprise) / (stated.FREEDOM + 1.0))
 
 
 def test_errors_age_to_what_is_known_of_their_variance() -> None:

@@ -108,6 +108,10 @@ def settle(
         raise ValueError(f"{text}: smooth on the way, with --lag 10")
     if (knots + between) * knot_bytes > MOST_BYTES:
         passes = 1
+    if belief.trust is not None and not between:
+        # ranges of others alone: derivatives where these very ranges have put the track share their errors, and their
+        # scale is then told more surely than it is (as in `update`)
+        passes = 1
     guide: Guide | None = None
     before: Follower | None = None
     for left in reversed(range(passes)):
