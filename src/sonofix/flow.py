@@ -288,7 +288,7 @@ class Street:
         return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
 
     def begin(self, time_s: float) -> None:
-        """Put vehicles where start.csv says, once; where sensors tell of their motion earlier, that is when they start."""
+        """Put vehicles where start.csv says, once: at the first epoch, or where sensors tell of motion earlier."""
         if self._start is None:
             return
         start, self._start = self._start, None

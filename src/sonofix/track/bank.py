@@ -35,15 +35,15 @@ STATES = 7
 
 
 @numba.njit(cache=True, error_model="numpy")
-def drive(mean, covariance, factor, arc, doubt, constants):
+def drive(mean, covariance, factor, arc, constants):
     """Move all members along an arc, in place.
 
-    ``mean`` (K, 7), ``covariance`` (K, 7, 7), ``factor`` (K, 3); ``arc`` (way, turn, dt), ``doubt`` (m², rad²) added
-    to their noise, ``constants`` those of `track.wheels`: noise of place a second and metre, of heading a second, metre
+    ``mean`` (K, 7), ``covariance`` (K, 7, 7), ``factor`` (K, 3); ``arc`` (way, turn, dt); ``constants`` those of
+    `track.wheels`: noise of place a second and metre, of heading a second, metre
     and radian, wander of scale and bias a second. The model is `wheels.measure`'s, as motion.
     """
     way, turn, dt = arc
-    bare = doubt[0] + constants[0] * dt + constants[1] * abs(way)
+    bare = constants[0] * dt + constants[1] * abs(way)
     twist = constants[2] * dt + constants[3] * abs(way) + constants[4] * abs(turn)
     for k in range(len(mean)):
         x, p = mean[k], covariance[k]
@@ -70,7 +70,7 @@ def drive(mean, covariance, factor, arc, doubt, constants):
         place = factor[k, 0] * bare
         p[0, 0] += place
         p[1, 1] += place
-        p[2, 2] += factor[k, 1] * twist + doubt[1]
+        p[2, 2] += factor[k, 1] * twist
         p[3, 3] += factor[k, 2] * constants[5] * dt
         p[4, 4] += factor[k, 2] * constants[6] * dt
 
@@ -141,7 +141,7 @@ class Bank:
         self._now_s, self._heard = None, []
 
     def take(self, before: Belief, after: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]) -> None:
-        """Take in an epoch; ``before`` is the track's belief predicted to its instant, ``after`` that corrected by it."""
+        """Take in an epoch: ``before`` is the track's belief predicted to its instant, ``after`` the one corrected."""
         at = SIZE * self._who
         if not (after.placed[self._who] and after.free[at + YAW]):
             self.forget()
@@ -170,7 +170,8 @@ class Bank:
     def _gather(self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]) -> None:
         """Keep an epoch's ranges to fixed ends until arcs have come that reach as far."""
         inputs, trust = before.inputs, before.trust
-        assert inputs is not None and trust is not None
+        assert inputs is not None
+        assert trust is not None
         listens = links.receiver_vehicle == self._who
         sounds = (links.emitter_vehicle == self._who) & (links.receiver_vehicle < 0)
         level = before.mean[SIZE * self._who + 2]
@@ -193,23 +194,25 @@ class Bank:
             wheels.CREEP_PSD, wheels.SLIP_M, wheels.TWIST_PSD, wheels.TWIST_M, wheels.TWIST_RAD,
             wheels.SCALE_PSD, wheels.BIAS_PSD,
         ])  # fmt: skip
-        first, last = np.searchsorted(self._end_s, [self._now_s, until_s], side="right")
+        now_s = self._now_s if self._now_s is not None else until_s
+        first, last = np.searchsorted(self._end_s, [now_s, until_s], side="right")
         for row in range(int(first), int(last)):
-            way, turn, dt = self._arc[row, :3]
-            if self._now_s is None or not np.isfinite(way + turn + dt) or dt > wheels.LONGEST_S:
+            way, turn, dt = self._arc[row, :3].tolist()
+            if not np.isfinite(way + turn + dt) or dt > wheels.LONGEST_S:
                 self.forget()
                 return
             end_s = float(self._end_s[row])
             stops = [one for one in self._heard if one[0] <= end_s]
             self._heard = self._heard[len(stops) :]
             for time_s, heard in [*((one[0], one) for one in stops), (end_s, None)]:
-                part = min(max(time_s - self._now_s, 0.0), dt) / dt if dt > 0 else 0.0
+                part = min(max(time_s - now_s, 0.0), dt) / dt if dt > 0 else 0.0
                 if part > 0:
-                    arc, doubt = part * self._arc[row, :3], np.zeros(2)
-                    drive(self._mean, self._covariance, self._factor, arc, doubt, constants)
-                    self._now_s = max(time_s, self._now_s)
+                    arc = part * self._arc[row, :3]
+                    drive(self._mean, self._covariance, self._factor, arc, constants)
+                    now_s = max(time_s, now_s)
                 if heard is not None:
                     _, other, arm, range_m, variance = heard
                     hear(self._mean, self._covariance, other, arm, range_m, variance, stated.FREEDOM, self._told)
+            self._now_s = now_s
             self._told -= self._told.max()
             self._told *= np.exp(-dt / MEMORY_S)

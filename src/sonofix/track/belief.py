@@ -234,7 +234,9 @@ def _sense(
         steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second, about)
     elif inputs.kind[row] == WHEELS:
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
-        wheels.take(mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about, belief.roughness(vehicle))
+        wheels.take(
+            mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about, belief.roughness(vehicle)
+        )
     elif inputs.kind[row] == GYRO:
         gyro.take(mean, covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), first, second)
     else:

@@ -18,8 +18,8 @@ from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place,
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
-from sonofix.track.wheels import AS_EXPECTED
 from sonofix.track.update import strangeness, update
+from sonofix.track.wheels import AS_EXPECTED
 
 PATIENCE = 3
 """Epochs in which most rows are refused before the track is put where the ranges say."""

@@ -117,7 +117,7 @@ class Trust:
         run[0, pair] = RUN * run[0, pair] + np.clip(miss / np.sqrt(spread), -SINGLE, SINGLE)
         run[1, pair] = RUN**2 * run[1, pair] + 1.0
         jumped = run[0, pair] ** 2 > JUMP * run[1, pair]
-        if 2 * np.count_nonzero(run[0] ** 2 > JUMP * run[1]) > np.count_nonzero(run[1]):
+        if 2 * np.count_nonzero(run[0] ** 2 > JUMP / 4 * run[1]) > np.count_nonzero(run[1]):
             jumped[:] = False  # it is the vehicle that moved
         run[:, pair[jumped]] = 0.0
         watched_s = self.watched_s.copy()
@@ -166,7 +166,16 @@ class Trust:
 def trust(pairs: int) -> Trust:
     """Return what is known of so many pairs before anything was heard."""
     every, each = np.zeros(pairs + 1), np.zeros((KINDS, pairs))
-    return Trust(every, every, every, each, each, np.full(KINDS, BEGIN_SD_M**2), np.zeros((2, pairs)), np.full((2, pairs), np.nan))
+    return Trust(
+        every,
+        every,
+        every,
+        each,
+        each,
+        np.full(KINDS, BEGIN_SD_M**2),
+        np.zeros((2, pairs)),
+        np.full((2, pairs), np.nan),
+    )
 
 
 def size(pairs: int) -> int:

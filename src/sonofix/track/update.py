@@ -27,7 +27,7 @@ ASTRAY = 1e-3
 
 
 BENT = 0.1
-"""Share of their own errors by which stated ranges may bend within what places are uncertain by, before iterations help."""
+"""Share of their own errors by which stated ranges may bend within what places are uncertain by, uniterated."""
 
 
 def update(
