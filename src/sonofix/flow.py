@@ -352,10 +352,13 @@ class Street:
         return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
 
     def begin(self, time_s: float) -> None:
-        """Put vehicles where start.csv says, once."""
+        """Put vehicles where start.csv says, once: at the first epoch, or where sensors tell of motion earlier."""
         if self._start is None:
             return
         start, self._start = self._start, None
+        inputs = self.follower.belief.inputs
+        if inputs is not None and len(inputs.time_s):
+            time_s = min(time_s, float(inputs.time_s[0]))
         if not self.site.vehicles:
             raise ValueError("start.csv places a vehicle, but the site has none: add a [[vehicle]]")
         vehicles = start.names.get("vehicle") or (self.site.vehicles[0].id,) * len(start.columns["x_m"])

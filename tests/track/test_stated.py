@@ -99,6 +99,43 @@ def test_noise_is_learnt_where_ranges_claim_too_little(rng: np.random.Generator)
     assert honest(miss[60:], sd[60:])
 
 
+def jumped(misses: Floats) -> tuple[stated.Trust, list[int]]:
+    """Let innovations (epochs, pairs), in deviations, be heard one a second; return epochs in which pair 0 jumped."""
+    known, when = stated.trust(misses.shape[1]), []
+    pair = np.arange(misses.shape[1])
+    for k, miss in enumerate(misses):
+        known, found = known.heard(pair, miss, np.ones(len(miss)), np.full(len(miss), float(k)))
+        assert not found[1:].any()
+        when += [k] if found[0] else []
+    return known, when
+
+
+def test_a_pair_that_keeps_to_one_side_while_others_do_not_has_jumped(rng: np.random.Generator) -> None:
+    misses = rng.standard_normal((60, 5))
+    misses[30:38, 0] = 6.0
+    known, when = jumped(misses)
+    # six counts as two and a half: after noise that fades, k such make 25 (1 - 0.9^k), and 10.3 is a jump
+    assert len(when) == 1
+    assert 31 <= when[0] <= 37
+    watched_s = 5 * 59.0
+    assert known.lasting_s == pytest.approx((stated.LASTING_S + watched_s) / 2)
+
+
+def test_neither_an_outlier_nor_a_vehicle_that_moves_is_a_jump(rng: np.random.Generator) -> None:
+    misses = rng.standard_normal((60, 5))
+    misses[30, 0] = 40.0
+    misses[45:55] = 6.0
+    known, when = jumped(misses)
+    assert not when
+    assert known.jumps == 0
+
+
+def test_noise_alone_is_no_jump(rng: np.random.Generator) -> None:
+    street, _, _, _ = walked(np.zeros((COUNT, 6)), rng)
+    assert street.follower.belief.trust is not None
+    assert street.follower.belief.trust.jumps == 0
+
+
 def test_errors_that_last_seconds_are_taken_as_such(rng: np.random.Generator) -> None:
     # multipath of 0.2 m, correlated over 2 s: white noise of that size would be averaged away far too soon
     fade = np.exp(-PERIOD_S / 2.0)
@@ -126,8 +163,8 @@ def test_the_tail_of_noise_weighs_less_and_less() -> None:
     pull = np.sqrt(surprise) / factor
     assert np.argmax(pull) < 45
     # the factor is that of the t density's score: d/dz log p = -z (ν + 1) / (ν + z²)
-    beyond = surprise > 1.0
-    assert factor[beyond] == pytest.approx((stated.FREEDOM + surprise[beyond]) / (stated.FREEDOM + 1.0))
+    fisher = (stated.FREEDOM + 1.0) / (stated.FREEDOM + 3.0)
+    assert fisher * factor == pytest.approx((stated.FREEDOM + surprise) / (stated.FREEDOM + 1.0))
 
 
 def test_errors_age_to_what_is_known_of_their_variance() -> None:

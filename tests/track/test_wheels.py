@@ -34,15 +34,20 @@ def test_an_arc_is_the_textbook_update_by_numerical_derivatives(rng: np.random.G
         mean, covariance = 0.05 * rng.standard_normal(n), half @ half.T
         way, turn, dt = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.1
 
+        # of all headings that it may have set out on, the mean
+        shorter = np.exp(-covariance[SLOT + 2, SLOT + 2] / 2)
+
         def turned(yaw: float) -> Floats:
             return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ ARM
 
-        def disagreement(x: Floats, way: float = way, turn: float = turn, dt: float = dt) -> Floats:
+        def disagreement(
+            x: Floats, way: float = way, turn: float = turn, dt: float = dt, shorter: float = shorter
+        ) -> Floats:
             # the origin drives the arc in a thousand short pieces; the arm turns with it
             pieces = 1000
             rate = (turn - x[SLOT + 4] * dt) / pieces
             yaw = x[SLOT + 2] + rate * (np.arange(pieces) + 0.5)
-            step = way * (1 - x[SLOT + 3]) / pieces
+            step = shorter * way * (1 - x[SLOT + 3]) / pieces
             driven = np.array([np.sum(step * np.cos(yaw)), np.sum(step * np.sin(yaw))])
             place = x[0:2] - x[SLOT : SLOT + 2] - driven - turned(x[3]) + turned(x[SLOT + 2])
             return np.append(place, x[3] - x[SLOT + 2] - pieces * rate)

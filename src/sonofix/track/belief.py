@@ -80,6 +80,8 @@ class Belief:
         How far each vehicle tilts (`geometry.tilting`); None: all stand upright.
     trust : Trust or None
         What has been learnt of ranges that others state; None where ranges are our own.
+    rough : float64 (V, 3) or None
+        Factors on the noise of each vehicle's odometry that were learnt (`bank`); None: it is as expected.
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -93,10 +95,15 @@ class Belief:
     about: Nominal | None = None
     tilt_sd_rad: Floats | None = None
     trust: Trust | None = None
+    rough: Floats | None = None
 
     def tilts(self, vehicle: int) -> float:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
         return 0.0 if self.tilt_sd_rad is None else float(self.tilt_sd_rad[vehicle])
+
+    def roughness(self, vehicle: int) -> Floats:
+        """Factors (3,) on the noise of a vehicle's odometry."""
+        return wheels.AS_EXPECTED if self.rough is None else self.rough[vehicle]
 
     @property
     def upright(self) -> bool:
@@ -199,14 +206,14 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
             if step >= 0:
                 steps.wander(mean, covariance, vehicle, step, until_s - now_s, bool(belief.placed[vehicle]))
             if wheel >= 0:
-                wheels.wander(covariance, free, vehicle, wheel, until_s - now_s)
+                wheels.wander(covariance, free, vehicle, wheel, until_s - now_s, belief.roughness(vehicle))
             if inputs.gyro_slot[vehicle] >= 0:
                 gyro.wander(covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), until_s - now_s)
         if belief.trust is not None:
             stated.wander(mean, covariance, inputs.range_slot, belief.trust, until_s - now_s)
         if row is not None and belief.placed[inputs.vehicle[row]]:
             about = None if belief.about is None else belief.near(belief.about.row[row], mean)
-            _sense(mean, covariance, free, inputs, row, about)
+            _sense(mean, covariance, free, belief, row, about)
         now_s = until_s
     return replace(belief, time_s=time_s, mean=mean, covariance=covariance, free=free)
 
@@ -219,16 +226,20 @@ def _rock(belief: Belief, mean: Floats, covariance: Floats, motion: Motion, dt: 
 
 
 def _sense(
-    mean: Floats, covariance: Floats, free: NDArray[np.bool_], inputs: Inputs, row: int, about: Floats | None
+    mean: Floats, covariance: Floats, free: NDArray[np.bool_], belief: Belief, row: int, about: Floats | None
 ) -> None:
     """Let one row of a vehicle's sensors enter, in place, at its time, linearised at ``about`` or else at the mean."""
+    inputs = belief.inputs
+    assert inputs is not None
     vehicle = int(inputs.vehicle[row])
     first, second, third, fourth = inputs.value[row].tolist()
     if inputs.kind[row] == STEP:
         steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second, about)
     elif inputs.kind[row] == WHEELS:
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
-        wheels.take(mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about)
+        wheels.take(
+            mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about, belief.roughness(vehicle)
+        )
     elif inputs.kind[row] == GYRO:
         gyro.take(mean, covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), first, second)
     else:

@@ -12,11 +12,14 @@ from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
+from sonofix.track import stated
+from sonofix.track.bank import Bank
 from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
 from sonofix.track.update import strangeness, update
+from sonofix.track.wheels import AS_EXPECTED
 
 PATIENCE = 3
 """Epochs in which most rows are refused before the track is put where the ranges say."""
@@ -69,6 +72,24 @@ class Follower:
         self._begun_s = np.full(len(site.vehicles), -np.inf)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
+        self._banks: dict[int, Bank] = {}
+        if inputs is not None and inputs.range_slot >= 0:
+            wheeled = np.flatnonzero(inputs.wheel_slot >= 0).tolist()
+            self._banks = {who: Bank(self.belief, who) for who in wheeled}
+
+    def knowing(self, other: Follower) -> Follower:
+        """Return this follower, at its beginning, with what another has learnt of the same recording by its end.
+
+        That is how agile vehicles are, how far odometry may be trusted and how ranges err: sizes, not values.
+        """
+        trust, inputs = other.belief.trust, self.belief.inputs
+        if trust is None or inputs is None:
+            return self
+        covariance = self.belief.covariance.copy()
+        stated.open_pairs(covariance, inputs.range_slot, trust)
+        self.belief = replace(self.belief, covariance=covariance, trust=trust, rough=other.belief.rough)
+        self.motion, self._banks = other.motion, {}
+        return self
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
         """Place a vehicle at a pose known beforehand."""
@@ -120,6 +141,7 @@ class Follower:
         self._loosen(before)
         used = self._contest(epoch, links, candidates, used, events)
         self.belief = self._course.head(self.belief)
+        self._doubt_wheels(before, epoch, links, candidates, events)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
@@ -207,6 +229,21 @@ class Follower:
         agree = float(now @ last) / (size * float(np.linalg.norm(last)))
         psd = self.motion.acceleration_psd * float(np.exp(AGILITY_RATE * agree))
         self.motion = replace(self.motion, acceleration_psd=float(np.clip(psd, *AGILITY)))
+
+    def _doubt_wheels(
+        self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]
+    ) -> None:
+        """Learn how far odometry may be trusted, where ranges are stated by others."""
+        anew = {event.vehicle for event in events if event.event in ("slip", "reset", "start")}
+        if not self._banks:
+            return
+        rough = np.tile(AS_EXPECTED, (len(self.site.vehicles), 1))
+        for who, bank in self._banks.items():
+            if self.site.vehicles[who].id in anew:
+                bank.forget()
+            bank.take(before, self.belief, epoch, links, asked)
+            rough[who] = bank.factors
+        self.belief = replace(self.belief, rough=rough)
 
     def _contest(
         self,

@@ -108,14 +108,21 @@ def settle(
         raise ValueError(f"{text}: smooth on the way, with --lag 10")
     if (knots + between) * knot_bytes > MOST_BYTES:
         passes = 1
+    if belief.trust is not None and not between:
+        # ranges of others alone: derivatives where these very ranges have put the track share their errors, and their
+        # scale is then told more surely than it is (as in `update`)
+        passes = 1
     guide: Guide | None = None
+    before: Follower | None = None
     for left in reversed(range(passes)):
-        passage = Passage(begin(), rate_hz, guide, rows or left > 0)
+        follower = begin() if before is None else begin().knowing(before)
+        passage = Passage(follower, rate_hz, guide, rows or left > 0)
         for one in heard:
             passage.take(one)
             on_epoch()
         if not left or not passage.marks:
             return passage
+        before = passage.follower
         following = guided(passage, () if guide is None else guide.openings)
         if guide is not None:
             with np.errstate(invalid="ignore"):

@@ -31,8 +31,11 @@ KINDS = 2
 BEGIN_SD_M = 0.1
 """Of slow errors, of quick ones and of noise beyond what is stated, each, before ranges have told."""
 
-CORRELATED_S = np.array([3000.0, 2.0])
-"""Of slow errors (antennas, walls) and of quick ones (multipath along the way)."""
+LASTING_S = 300.0
+"""Correlation time of slow errors (antennas, walls) where none was seen to jump."""
+
+QUICK_S = 2.0
+"""Correlation time of quick errors (multipath along the way)."""
 
 FREEDOM = 4.0
 """Of Student's t distribution, as which noise is taken: outliers of many metres then weigh next to nothing."""
@@ -45,6 +48,16 @@ POOL = 10.0
 
 RATE = 0.02
 """How fast variances of slow and quick errors follow, per range."""
+
+JUMP = 20.0
+"""Squared sum of a pair's last innovations, over its variance, at which its error has jumped: noise alone comes there
+once in a hundred thousand."""
+
+RUN = 0.9
+"""How fast innovations of a pair are forgotten, per range, in that sum."""
+
+SINGLE = 2.5
+"""A single innovation counts as at most so many deviations there: one outlier is none."""
 
 MOST = 9.0
 """A single square counts as at most so many variances."""
@@ -62,6 +75,12 @@ class Trust:
         Sums of squared slow and quick errors, and their number, faded.
     pool : float64 (2,)
         Variance (m²) of slow and quick errors over all pairs.
+    run : float64 (2, P)
+        Sums of each pair's last normalised innovations and of their variances, faded.
+    watched_s : float64 (2, P)
+        When each pair was first and last heard, of all pairs that were; NaN of others.
+    jumps : int
+        How often a pair's error has jumped.
     told : float
         Logarithm of the likelihood of the epoch just taken in.
     """
@@ -72,6 +91,9 @@ class Trust:
     own: Floats
     weight: Floats
     pool: Floats
+    run: Floats
+    watched_s: Floats
+    jumps: int = 0
     told: float = 0.0
 
     @property
@@ -84,6 +106,31 @@ class Trust:
         every = (self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
         beyond = self.square[pair] - self.stated[pair] + POOL * every
         return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
+
+    def heard(
+        self, pair: NDArray[np.int64], miss: Floats, spread: Floats, time_s: Floats
+    ) -> tuple[Trust, NDArray[np.bool_]]:
+        """Return what is known once innovations (n,) of variances ``spread`` came, and the rows whose error jumped.
+
+        Innovations of a pair whose error is what it is taken for are white; where those of few pairs keep to one side
+        while others do not, something stepped into their way (generalised likelihood ratio: Willsky and Jones 1976).
+        """
+        run = self.run.copy()
+        run[0, pair] = RUN * run[0, pair] + np.clip(miss / np.sqrt(spread), -SINGLE, SINGLE)
+        run[1, pair] = RUN**2 * run[1, pair] + 1.0
+        jumped = run[0, pair] ** 2 > JUMP * run[1, pair]
+        if 2 * np.count_nonzero(run[0] ** 2 > JUMP / 4 * run[1]) > np.count_nonzero(run[1]):
+            jumped[:] = False  # it is the vehicle that moved
+        run[:, pair[jumped]] = 0.0
+        watched_s = self.watched_s.copy()
+        watched_s[0, pair] = np.fmin(watched_s[0, pair], time_s)
+        watched_s[1, pair] = time_s
+        return replace(self, run=run, watched_s=watched_s, jumps=self.jumps + int(np.count_nonzero(jumped))), jumped
+
+    @property
+    def lasting_s(self) -> float:
+        """Correlation time of slow errors: the time between jumps of one pair, by all pairs (a Poisson process)."""
+        return (LASTING_S + float(np.nansum(self.watched_s[1] - self.watched_s[0]))) / (1.0 + self.jumps)
 
     def anew(self) -> Trust:
         """Return what another track may begin with: noise as large, soon forgotten; errors as before anything."""
@@ -121,7 +168,16 @@ class Trust:
 def trust(pairs: int) -> Trust:
     """Return what is known of so many pairs before anything was heard."""
     every, each = np.zeros(pairs + 1), np.zeros((KINDS, pairs))
-    return Trust(every, every, every, each, each, np.full(KINDS, BEGIN_SD_M**2))
+    return Trust(
+        every,
+        every,
+        every,
+        each,
+        each,
+        np.full(KINDS, BEGIN_SD_M**2),
+        np.zeros((2, pairs)),
+        np.full((2, pairs), np.nan),
+    )
 
 
 def size(pairs: int) -> int:
@@ -143,15 +199,24 @@ def begin(mean: Floats, covariance: Floats, free: NDArray[np.bool_], slot: int, 
     free[own] = True
 
 
+def open_pairs(covariance: Floats, slot: int, known: Trust) -> None:
+    """Give the errors of pairs the variances that are known of them, in place: before anything was heard."""
+    at = np.arange(slot + COMMON, slot + COMMON + known.own.size)
+    covariance[at, at] = known.variance.ravel()
+    covariance[slot + 1, slot + 1] = max(BIAS_SD_M**2, known.pool[0])
+
+
 def wander(mean: Floats, covariance: Floats, slot: int, known: Trust, dt: float) -> None:
     """Let slow and quick errors age by ``dt``, in place (Gelb 1974, section 3.7)."""
     own = slice(slot + COMMON, slot + COMMON + known.own.size)
-    fade = np.repeat(np.exp(-abs(dt) / CORRELATED_S), known.own.shape[1])
+    fade = np.repeat(np.exp(-abs(dt) / np.array([known.lasting_s, QUICK_S])), known.own.shape[1])
     mean[own] *= fade
     covariance[own, :] *= fade[:, None]
     covariance[:, own] *= fade
     at = np.arange(own.start, own.stop)
     covariance[at, at] += known.variance.ravel() * (1.0 - fade**2)
+    # where pairs err by more than was expected, so may what they share
+    covariance[slot + 1, slot + 1] += max(known.pool[0] - BIAS_SD_M**2, 0.0) * (1.0 - fade[0] ** 2)
 
 
 def places(slot: int, pair: NDArray[np.int64], pairs: int) -> NDArray[np.int64]:
@@ -171,8 +236,12 @@ def show(
 
 
 def heavier(surprise: Floats) -> Floats:
-    """Return the factor on a row's variance that Student's t asks for, by its squared innovation over its variance."""
-    return np.maximum((FREEDOM + surprise) / (FREEDOM + 1.0), 1.0)
+    """Return the factor on a row's variance that Student's t asks for, by its squared innovation over its variance.
+
+    Noise of known weights (ν + 1) / (ν + z²) would tell (ν + 3) / (ν + 1) times what such a row tells (Fisher's
+    information of t about its place: Lange, Little and Taylor 1989), so it is larger by that.
+    """
+    return (FREEDOM + 3.0) / (FREEDOM + 1.0) * (FREEDOM + surprise) / (FREEDOM + 1.0)
 
 
 def log_likelihood(surprise: Floats, variance: Floats) -> float:

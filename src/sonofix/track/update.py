@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, rows_at
+from sonofix.geometry import SIZE, Links, rows_at
 from sonofix.locate.noise import row_noise
 from sonofix.records import Floats, RangeEpoch
 from sonofix.track import paired, stated
@@ -27,6 +27,10 @@ WHOLE_STEPS = 8
 
 ASTRAY = 1e-3
 """Ranges are not believed where the state still moves by more when iterations have run out."""
+
+
+BENT = 0.1
+"""Share of their own errors by which stated ranges may bend within what places are uncertain by, uniterated."""
 
 
 def update(
@@ -69,6 +73,13 @@ def update(
     miss = measured - shown - derivative @ (belief.mean - mean)
     crossed = derivative @ belief.covariance
     spread = np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal()
+    if trust is not None:
+        trust, jumped = trust.heard(pair, miss, spread, epoch.time_s[rows])
+        if jumped.any():
+            belief = _jumped(belief, pair[jumped], miss[jumped])
+            crossed = derivative @ belief.covariance
+            spread = np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal()
+        belief = replace(belief, trust=trust)
     surprise = miss**2 / spread
     # a row is believed where its range is, and its rate if it has one
     near = (surprise <= GATE_SIGMA**2).reshape(-1, len(rows)).all(axis=0)
@@ -90,6 +101,8 @@ def update(
         links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
         pair = pair[near] if len(pair) else pair
         miss, derivative, crossed = miss[both], derivative[both], crossed[both]
+    if trust is not None and not _bent(belief, measured, noise.diagonal() + trust.variance[:, pair].sum(axis=0)):
+        iterations = 1
     gain, last = np.zeros((0, 0)), np.inf
     for k in range(iterations if belief.about is None else 1):
         if k:
@@ -109,6 +122,27 @@ def update(
     covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
     after = replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2)
     return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
+
+
+def _bent(belief: Belief, range_m: Floats, variance: Floats) -> bool:
+    """Whether ranges bend within what places are uncertain by, by more than a share of what they err by themselves.
+
+    Where they do not, an update is not iterated: derivatives at a place that the very same ranges gave share their
+    noise, and thousands of such updates tell scale and bias more surely than they are (Huang, Mourikis and
+    Roumeliotis 2010, of inconsistent filters).
+    """
+    poses = np.arange(SIZE * len(belief.placed)).reshape(-1, SIZE)[belief.placed, :3]
+    sigma2 = float(belief.covariance[poses, poses].sum(axis=1).max())
+    return sigma2 > BENT * 2.0 * float(np.min(np.abs(range_m) * np.sqrt(variance)))
+
+
+def _jumped(belief: Belief, pair: NDArray[np.int64], miss: Floats) -> Belief:
+    """Open the slow errors of pairs by what they miss."""
+    assert belief.inputs is not None
+    covariance = belief.covariance.copy()
+    at = stated.places(belief.inputs.range_slot, pair, len(belief.inputs.pairs))[0]
+    covariance[at, at] += miss**2
+    return replace(belief, covariance=covariance)
 
 
 def pairs_of(belief: Belief, epoch: RangeEpoch, rows: NDArray[np.int64]) -> NDArray[np.int64]:

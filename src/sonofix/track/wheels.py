@@ -59,14 +59,20 @@ ROBUST = 2.0
 """A reading that is off by more deviations than this counts as much less (Huber 1964)."""
 
 
+AS_EXPECTED = np.ones(3)
+"""Factors on variances: of noise of place and of heading, and of how scale and bias wander (`track.bank`)."""
+
+
 def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
     """Open the errors of a vehicle's odometry, in place, before anything is known of them."""
     open_errors(covariance, free, slot + 3, (SCALE_SD, BIAS_SD_RADPS))
 
 
-def wander(covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int, dt: float) -> None:
+def wander(
+    covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int, dt: float, rough: Floats = AS_EXPECTED
+) -> None:
     """Let the errors of odometry wander for ``dt``, in place, and its turns be as free as rows may tell."""
-    span = abs(dt)
+    span = abs(dt) * float(rough[2])
     covariance[slot + 3, slot + 3] += SCALE_PSD * span
     covariance[slot + 4, slot + 4] += BIAS_PSD * span
     free_turns(covariance, free, vehicle, dt)
@@ -81,6 +87,7 @@ def take(
     arc: tuple[float, float, float, float],
     arm: Floats,
     about: Floats | None = None,
+    rough: Floats = AS_EXPECTED,
 ) -> None:
     """Correct a belief at the end of an arc, in place, and put the anchor there.
 
@@ -90,8 +97,11 @@ def take(
     at = SIZE * vehicle
     way, turn, dt, unseen = arc
     if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and dt <= LONGEST_S:
-        about = mean if about is None else about
-        miss, derivative, noise = measure(about, vehicle, slot, (way, turn, dt), arm)
+        if about is None:
+            # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
+            way *= float(np.exp(-covariance[slot + 2, slot + 2] / 2))
+            about = mean
+        miss, derivative, noise = measure(about, vehicle, slot, (way, turn, dt), arm, rough)
         correct(mean, covariance, miss - derivative @ (mean - about), derivative, noise, UNLIKELY)
     if free[at + 3]:
         covariance[at + 3, at + 3] += unseen**2
@@ -104,7 +114,7 @@ def take(
 
 
 def measure(
-    about: Floats, vehicle: int, slot: int, arc: tuple[float, float, float], arm: Floats
+    about: Floats, vehicle: int, slot: int, arc: tuple[float, float, float], arm: Floats, rough: Floats = AS_EXPECTED
 ) -> tuple[Floats, Floats, Floats]:
     """Return by how much an arc (way, turn, time) misses a state (3,), what it measures there, and its covariance.
 
@@ -138,7 +148,7 @@ def measure(
     derivative[2, slot + 4] = dt
     place = CREEP_PSD * dt + SLIP_M * abs(way)
     heading = TWIST_PSD * dt + TWIST_M * abs(way) + TWIST_RAD * abs(turn)
-    return miss, derivative, np.diag([place, place, heading])
+    return miss, derivative, np.diag([rough[0] * place, rough[0] * place, rough[1] * heading])
 
 
 def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, heading_rad: float) -> None:
