@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from team.made_fleet import errors, fleet, nees
 
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
@@ -8,6 +7,7 @@ from sonofix.team.fleet import follow
 from sonofix.team.message import BYTES, Message, unpack
 from sonofix.team.smooth import smooth
 from sonofix.team.tell import steps_of
+from team.made_fleet import errors, fleet, nees
 
 
 def run(recording, **options):

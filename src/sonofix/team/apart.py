@@ -1,10 +1,10 @@
 """The team as it truly is: each robot keeps an estimate of itself alone, by its own sensors and what others tell it.
 
-When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that both
-know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013): the part of
-an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and 1/(1 − w); the part
-that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has been told. So estimates
-are never surer than they may be, whoever tells whom however often, joins or leaves.
+When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that
+both know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013): the
+part of an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and
+1/(1 − w); the part that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has been
+told. So estimates are never surer than they may be, whoever tells whom however often, joins or leaves.
 """
 
 from __future__ import annotations
@@ -100,6 +100,7 @@ class Apart:
         mean, covariance = self.belief.mean.copy(), self.belief.covariance.copy()
         result = np.zeros((1, 2), bool), np.full((1, 2, 4), np.nan)
         corrected: dict[int, tuple[Floats, Floats]] = {}
+        heard = result
         for robot, other in ((listener, source), (source, listener)):
             best: tuple[float, Floats, Floats] | None = None
             for share in SHARES:

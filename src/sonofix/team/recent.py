@@ -33,7 +33,10 @@ class Recent:
         feed = self._feed
         for i in range(*rows):
             time_s = float(feed.time_s[i])
-            for robot, other in ((int(feed.listener[i]), int(feed.source[i])), (int(feed.source[i]), int(feed.listener[i]))):
+            for robot, other in (
+                (int(feed.listener[i]), int(feed.source[i])),
+                (int(feed.source[i]), int(feed.listener[i])),
+            ):
                 if robot < 0:
                     continue
                 self._heard_s[robot] = time_s
