@@ -13,7 +13,7 @@ from sonofix.draw import style
 from sonofix.draw.team import draw_landmarks, ellipse, places, tracks_of
 from sonofix.records import Recording, Step, Truth
 
-FRAMES = 120
+FRAMES = 80
 """At most."""
 
 FRAME_MS = 80

@@ -162,8 +162,8 @@ class Belief:
         found = np.full((count, 2, 4), np.nan)
         told = self.noise
         hear(
-            self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows, feed.time_s,
-            feed.kind, feed.listener, feed.source,
+            self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows,
+            feed.time_s, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.pair,
             told.ranges, told.bearings, told.share, told.last_s, told.believed, 1.0 / feed.sound_speed_mps, self.speed,
             used, found, np.empty((3, len(self.mean))),
@@ -237,7 +237,7 @@ class Watch:
         """
         worst: tuple[float, int, list[int]] | None = None
         for robot, latest in enumerate(self._latest):
-            if len(latest) < 4 or any(ok for _, _, ok in list(latest)[-3:]):
+            if len(latest) < 4:
                 continue
             refused = {pair: row for row, pair, ok in latest if not ok}
             share = sum(not ok for _, _, ok in latest) / len(latest)

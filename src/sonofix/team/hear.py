@@ -64,8 +64,9 @@ def crowd(rows, listener, range_m):
 
 @numba.njit(cache=True, error_model="numpy")
 def hear(
-    mean, covariance, about, follows, placed, rows, time_s, kind, listener, source, listener_point, source_point, range_m,
-    range_sd_m, bearing_rad, pair, ranges, bearings, share, last_s, believed, flight_s_per_m, speed, used, told, work,
+    mean, covariance, about, follows, placed, rows, time_s, kind, listener, source, listener_point, source_point,
+    range_m, range_sd_m, bearing_rad, pair, ranges, bearings, share, last_s, believed, flight_s_per_m, speed, used,
+    told, work,
 ):  # fmt: skip
     """Take the measurements of some ``rows`` in, in place.
 

@@ -20,8 +20,8 @@ STATES = (
     "bearing_offset",
 )
 """Of one robot, in m and rad: its pose; by what shares of themselves its odometry tells speed and yaw rate too high,
-and the yaw rate that it tells at rest (rad/s); how much later (s) than told its wheels move it; and the errors of what it
-hears: ranges are (1 + range_scale) r + range_bias, bearings bearing_offset too far left."""
+and the yaw rate that it tells at rest (rad/s); how much later (s) than told its wheels move it; and the errors of what
+it hears: ranges are (1 + range_scale) r + range_bias, bearings bearing_offset too far left."""
 
 SIZE = len(STATES)
 X, Y, YAW, SPEED, TURN, DRIFT, LAG, SCALE, BIAS, OFFSET = range(SIZE)
