@@ -23,8 +23,8 @@ def fleet(
 ) -> tuple[Recording, dict[str, np.ndarray]]:
     """Return a recording and, of each robot, true rows (time, x, y, yaw).
 
-    ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: a robot, when,
-    and how far to the side. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as `sonofix.team.kernel` has it.
+    ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: a robot,
+    when, and how far. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as `sonofix.team.kernel` has it.
     """
     rng = np.random.default_rng(seed)
     silent, dt = silent or {}, 0.1

@@ -71,7 +71,9 @@ def test_derivatives_of_what_is_heard_are_finite_differences(first, second, ends
     expect(about, *ends, *arms, 1 / 343, speed, rows)
     for j in range(2 * SIZE):
         h = 1e-6
-        told = [expect(about + sign * h * np.eye(2 * SIZE)[j], *ends, *arms, 1 / 343, speed, scratch) for sign in (1, -1)]
+        told = [
+            expect(about + sign * h * np.eye(2 * SIZE)[j], *ends, *arms, 1 / 343, speed, scratch) for sign in (1, -1)
+        ]
         difference = (np.array(told[0][:2]) - told[1][:2]) / (2 * h)
         if abs(difference[1]) > 1e3:  # the direction jumps by a turn here
             continue

@@ -159,7 +159,11 @@ def _run(
             from sonofix.draw.team_film import write_film
             from sonofix.files.writing import write_whole
 
-            write_whole(animate, lambda part: write_film(part, recording, kept, truths))
+            def film(part: Path) -> None:
+                with part.open("wb") as file:
+                    write_film(file, recording, kept, truths)
+
+            write_whole(animate, film)
             speaker().print(f"Animation: {animate}")
     speaker().print(f"Written to {out}")
 
@@ -171,7 +175,9 @@ def _stems(folder: Path) -> set[str]:
 def _check(recording: Recording, landmarks_of: list[str] | None) -> None:
     ids = [vehicle.id for vehicle in recording.site.vehicles]
     if len(ids) < 2:
-        raise ValueError(f"site.toml: holds {counted(len(ids), 'vehicle')}; a team has two or more; for one: sonofix run")
+        raise ValueError(
+            f"site.toml: holds {counted(len(ids), 'vehicle')}; a team has two or more; for one: sonofix run"
+        )
     for name in landmarks_of or ():
         if name not in ids:
             raise ValueError(f"--landmarks-of {name}: no vehicle of the site; it has {', '.join(ids)}")
@@ -227,7 +233,13 @@ def _summarise(folder: Path, out: Path, feed: Feed, moments: list[Moment], score
         found = score_run(folder, out)
         if found.track:
             every = track_rows(found.track)
-            keep = ("position error, rms", "95 % within", "heading error, rms", "inside 2 sd", "NEES of x, y (2 is right)")
+            keep = (
+                "position error, rms",
+                "95 % within",
+                "heading error, rms",
+                "inside 2 sd",
+                "NEES of x, y (2 is right)",
+            )
             print_table("Against the truth", tuple(found.track), {name: every[name] for name in keep})
     events = [event for moment in moments for event in moment.events]
     if events:

@@ -87,7 +87,9 @@ def ellipse(estimate: Estimate, colour: str) -> Ellipse:
     width, height = 6 * np.sqrt(np.maximum(value, 0.0))
     angle = float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0])))
     x, y = estimate.position_m[:2]
-    return Ellipse((float(x), float(y)), width, height, angle=angle, fill=False, edgecolor=colour, linewidth=0.8, alpha=0.8)
+    return Ellipse(
+        (float(x), float(y)), width, height, angle=angle, fill=False, edgecolor=colour, linewidth=0.8, alpha=0.8
+    )
 
 
 def draw_landmarks(axes: Axes, recording: Recording) -> None:
@@ -130,12 +132,14 @@ def _draw_doubt(
 
 
 def _draw_roles(axes: Axes, tracks: Mapping[str, Sequence[Estimate]], colours: Mapping[str, str]) -> None:
-    """One lane a robot: thin where it stands (others place themselves by it), thick where it moves, none where unplaced."""
+    """One lane a robot: thin where it stands, for others to go by; thick where it moves; none where it has no place."""
     for lane, (name, track) in enumerate(tracks.items()):
         time = np.array([estimate.time_s for estimate in track])
         moves = np.array([np.hypot(*estimate.velocity_mps[:2]) > STANDING_MPS for estimate in track])
         apart = np.concatenate([np.diff(time) > 5.0, [True]])
-        changes = np.flatnonzero(np.concatenate([[True], moves[1:] != moves[:-1]]) | np.concatenate([[True], apart[:-1]]))
+        changes = np.flatnonzero(
+            np.concatenate([[True], moves[1:] != moves[:-1]]) | np.concatenate([[True], apart[:-1]])
+        )
         for a, b in zip(changes, [*changes[1:], len(time)], strict=True):
             end = time[b] if b < len(time) and not apart[b - 1] else time[b - 1]
             height = 0.62 if moves[a] else 0.16

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from sonofix.draw import style
 from sonofix.draw.team import draw_landmarks, ellipse, places, tracks_of
 from sonofix.records import Recording, Step, Truth
 
-FRAMES = 120
+FRAMES = 80
 """At most."""
 
 FRAME_MS = 80
@@ -21,7 +22,9 @@ TAIL_S = 0.08
 """Share of the recording that each track's tail shows."""
 
 
-def write_film(path: Path, recording: Recording, steps: Sequence[Step], truths: Mapping[str, Truth] | None = None) -> None:
+def write_film(
+    file: BinaryIO, recording: Recording, steps: Sequence[Step], truths: Mapping[str, Truth] | None = None
+) -> None:
     """Write a GIF of a team's estimates, their ellipses and tails; hollow marks are the truth.
 
     Raises
@@ -43,6 +46,7 @@ def write_film(path: Path, recording: Recording, steps: Sequence[Step], truths: 
         figure.set_size_inches(7.0, 7.0)
         axes = figure.add_axes((0.09, 0.07, 0.87, 0.86))
         figure.set_dpi(72)
+        canvas = FigureCanvasAgg(figure)
         frames: list[Image.Image] = []
         for now in np.linspace(begin, end, FRAMES):
             axes.clear()
@@ -67,7 +71,6 @@ def write_film(path: Path, recording: Recording, steps: Sequence[Step], truths: 
             axes.set_xlim(low[0] - margin, high[0] + margin)
             axes.set_ylim(low[1] - margin, high[1] + margin)
             style.dress(axes, recording.site.name or "team", f"{now:.0f} s")
-            canvas = figure.canvas
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3]).quantize(64))
-        frames[0].save(path, format="GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0)
+        frames[0].save(file, format="GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0)

@@ -1,10 +1,10 @@
 """The team as it truly is: each robot keeps an estimate of itself alone, by its own sensors and what others tell it.
 
-When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that both
-know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013): the part of
-an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and 1/(1 − w); the part
-that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has been told. So estimates
-are never surer than they may be, whoever tells whom however often, joins or leaves.
+When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that
+both know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013):
+the part of an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and
+1/(1 − w); the part that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has
+been told. So estimates are never surer than they may be, whoever tells whom however often, joins or leaves.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sonofix.records import Event, Floats
 from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.fleet import ASK_S, LEFT_S, START_SD, Belief, Moment, Watch, instants
 from sonofix.team.message import SENT, Message, unpack
-from sonofix.team.noise import Noise, noise
+from sonofix.team.noise import Noise, beyond, noise, scatter
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
 from sonofix.team.state import POSE, SIZE
@@ -32,6 +32,9 @@ GAIN = 0.8
 
 EVERY_S = 1.0
 """Two robots that meet tell each other no more often."""
+
+SURE = (0.3, 0.2)
+"""In m and rad: only a robot that knows its place so well may place another."""
 
 UNSURE = (1.5, 0.7)
 """In m and rad: a robot that knows its place no better is to be placed anew, as corrections are no longer linear."""
@@ -95,11 +98,20 @@ class Apart:
     def _exchange(self, row: int, listener: int, source: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
         """Let two robots that meet tell each other, and correct themselves by it."""
         time_s = float(self.feed.time_s[row])
-        said = {robot: unpack(self._say(robot, time_s)) for robot in (listener, source)}
+        measured = np.full(4, np.nan)
+        measured[:2] = self.feed.range_m[row], self.feed.bearing_rad[row]
+        if np.isfinite(measured[0]):
+            measured[2] = beyond(told.ranges, listener, measured[0])
+        measured[3] = scatter(told.bearings, listener)
+        said = {
+            listener: unpack(self._say(listener, time_s, measured)),
+            source: unpack(self._say(source, time_s, np.full(4, np.nan))),
+        }
         self.told += 2
         mean, covariance = self.belief.mean.copy(), self.belief.covariance.copy()
         result = np.zeros((1, 2), bool), np.full((1, 2, 4), np.nan)
         corrected: dict[int, tuple[Floats, Floats]] = {}
+        heard = result
         for robot, other in ((listener, source), (source, listener)):
             best: tuple[float, Floats, Floats] | None = None
             for share in SHARES:
@@ -123,13 +135,12 @@ class Apart:
             self.dependent[at, at] = self.belief.covariance[at, at]
         return result
 
-    def _say(self, robot: int, time_s: float) -> bytes:
+    def _say(self, robot: int, time_s: float, measured: Floats) -> bytes:
         """Return a robot's message."""
         at = np.array(SENT) + SIZE * robot
         both = np.ix_(at, at)
-        nothing = np.full(4, np.nan)
         return Message(
-            robot, time_s, self.belief.mean[at], self.belief.covariance[both], self.dependent[both], nothing
+            robot, time_s, self.belief.mean[at], self.belief.covariance[both], self.dependent[both], measured
         ).pack()
 
     def _bound(self, mean: Floats, covariance: Floats, robot: int, other: Message, share: float) -> _Bound:
@@ -189,7 +200,7 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
             _lift(team, recent, robot)
             text = "what is heard disagrees with its track: to be placed anew"
             events.append(Event(time_s, feed.robots[robot], "lost", text))
-        recent.add(belief.mean, belief.placed, (first, last))
+        recent.add(belief.mean, belief.placed, (first, last), _sure(belief))
         if time_s - asked_s >= ASK_S:
             asked_s = time_s
             for robot in range(len(feed.robots)):
@@ -205,8 +216,17 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
 
 
 def _unsure(belief: Belief, robot: int) -> bool:
+    return not _within(belief, robot, UNSURE)
+
+
+def _within(belief: Belief, robot: int, sd: tuple[float, float]) -> bool:
     variance = np.diag(belief.covariance)[belief.at(robot)]
-    return bool(max(variance[0], variance[1]) > UNSURE[0] ** 2 or variance[2] > UNSURE[1] ** 2)
+    return bool(max(variance[0], variance[1]) <= sd[0] ** 2 and variance[2] <= sd[1] ** 2)
+
+
+def _sure(belief: Belief) -> NDArray[np.bool_]:
+    """Return which robots may place others."""
+    return belief.placed & [_within(belief, robot, SURE) for robot in range(len(belief.placed))]
 
 
 def _lift(team: Apart, recent: Recent, robot: int) -> None:
@@ -219,7 +239,7 @@ def _lift(team: Apart, recent: Recent, robot: int) -> None:
 def _join(team: Apart, recent: Recent, robot: int, time_s: float, events: list[Event]) -> None:
     """Place a robot by landmarks and by what others said of themselves, whose errors may all be shared."""
     belief = team.belief
-    clues = recent.clues(robot, time_s, belief.placed)
+    clues = recent.clues(robot, time_s, _sure(belief))
     found = None if clues is None else place(clues, belief.mean[belief.at(robot)])
     if found is None:
         return

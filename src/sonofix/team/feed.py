@@ -131,7 +131,9 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
     numbers = {end: i for i, end in enumerate(dict.fromkeys(ends))}
     place = {end: _ends(site, robots, level, end) for end in numbers}
     kind = np.array([row[1] for row in rows], np.int64)
-    listener = np.array([place[end][0] if k == SIGHTING else robots.index(end[1]) for end, k in zip(ends, kind, strict=True)])
+    listener = np.array(
+        [place[end][0] if k == SIGHTING else robots.index(end[1]) for end, k in zip(ends, kind, strict=True)]
+    )
     return Feed(
         robots=robots,
         level_m=level,
@@ -192,13 +194,21 @@ def _sightings(ranges: RangeRows | None, bearings: Table | None) -> list[_Row]:
     found: dict[tuple[float, str, str, int], _Row] = {}
     if ranges is not None:
         sd = np.full(len(ranges.time_s), np.nan) if ranges.sd_m is None else ranges.sd_m
-        told = zip(ranges.time_s.tolist(), ranges.emitter, ranges.receiver, ranges.range_m.tolist(), sd.tolist(), strict=True)
+        told = zip(
+            ranges.time_s.tolist(), ranges.emitter, ranges.receiver, ranges.range_m.tolist(), sd.tolist(), strict=True
+        )
         for i, (t, emitter, receiver, r, s) in enumerate(told):
             if np.isfinite(r):
                 again = i if (t, emitter, receiver, -1) in found else -1
                 found[t, emitter, receiver, again] = (t, SIGHTING, emitter, receiver, r, s, np.nan)
     if bearings is not None:
-        told = zip(bearings.columns["time_s"].tolist(), bearings.names["from"], bearings.names["to"], bearings.columns["bearing_rad"].tolist(), strict=True)
+        told = zip(
+            bearings.columns["time_s"].tolist(),
+            bearings.names["from"],
+            bearings.names["to"],
+            bearings.columns["bearing_rad"].tolist(),
+            strict=True,
+        )
         for i, (t, emitter, receiver, bearing) in enumerate(told):
             if not np.isfinite(bearing):
                 continue
@@ -207,11 +217,21 @@ def _sightings(ranges: RangeRows | None, bearings: Table | None) -> list[_Row]:
             if row is not None and not np.isfinite(row[6]):
                 found[key] = (*row[:6], bearing)
             else:
-                found[(t, emitter, receiver, -2 - i) if row is not None else key] = (t, SIGHTING, emitter, receiver, np.nan, np.nan, bearing)
+                found[(t, emitter, receiver, -2 - i) if row is not None else key] = (
+                    t,
+                    SIGHTING,
+                    emitter,
+                    receiver,
+                    np.nan,
+                    np.nan,
+                    bearing,
+                )
     return list(found.values())
 
 
-def _ends(site: Site, robots: tuple[str, ...], level_m: Floats, end: tuple[str, str]) -> tuple[int, int, Floats, Floats]:
+def _ends(
+    site: Site, robots: tuple[str, ...], level_m: Floats, end: tuple[str, str]
+) -> tuple[int, int, Floats, Floats]:
     """Robots (−1: none) and points of a row's listener and source."""
     emitter, receiver = end
     beacons, microphones = {b.id: b for b in site.beacons}, {m.id: m for m in site.microphones}

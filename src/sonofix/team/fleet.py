@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,7 @@ def instants(feed: Feed) -> list[tuple[float, int, int]]:
     begin, end = float(feed.odometry_s.min()), float(feed.odometry_s.max())
     out: list[tuple[float, int, int]] = []
     last = min(begin, float(feed.time_s[0])) if len(feed.time_s) else begin
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in pairwise(edges):
         time = float(feed.time_s[a])
         out += [(t, a, a) for t in _between(last, time)]
         out.append((time, a, b))
@@ -151,9 +152,7 @@ class Belief:
             from_s, until_s, psd, self.by, self.drive_noise, self.speed,
         )  # fmt: skip
 
-    def hear(
-        self, feed: Feed, rows: tuple[int, int], about: Floats | None = None
-    ) -> tuple[NDArray[np.bool_], Floats]:
+    def hear(self, feed: Feed, rows: tuple[int, int], about: Floats | None = None) -> tuple[NDArray[np.bool_], Floats]:
         """Take measurements in; return which ranges and bearings were, and what `hear.hear` tells of them.
 
         They are linearised ``about`` some state, or else at the mean as it moves.
@@ -163,7 +162,8 @@ class Belief:
         found = np.full((count, 2, 4), np.nan)
         told = self.noise
         hear(
-            self.mean, self.covariance, self.mean if about is None else about, self.placed, rows, feed.time_s, feed.kind, feed.listener, feed.source,
+            self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows,
+            feed.time_s, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.pair,
             told.ranges, told.bearings, told.share, told.last_s, told.believed, 1.0 / feed.sound_speed_mps, self.speed,
             used, found, np.empty((3, len(self.mean))),
@@ -237,7 +237,7 @@ class Watch:
         """
         worst: tuple[float, int, list[int]] | None = None
         for robot, latest in enumerate(self._latest):
-            if len(latest) < 4 or any(ok for _, _, ok in list(latest)[-3:]):
+            if len(latest) < 4:
                 continue
             refused = {pair: row for row, pair, ok in latest if not ok}
             share = sum(not ok for _, _, ok in latest) / len(latest)
@@ -337,8 +337,8 @@ def _reopen(
 ) -> None:
     """Find a robot that is not where its track has it: open its place where that began, and hear anew what came since.
 
-    Far from where it was, a first linearisation is a poor one, so it is done about what it led to, again and again (Bell
-    and Cathey 1993). Where that explains too little, the robot's place is taken away.
+    Far from where it was, a first linearisation is a poor one, so it is done about what it led to, again and again
+    (Bell and Cathey 1993). Where that explains too little, the robot's place is taken away.
     """
     robot, rows = found
     watch.clear(robot)

@@ -26,6 +26,12 @@ REFUSED = 25.0
 """Squared miss, over its variance, beyond which a measurement is not believed."""
 
 
+TURNS = 4
+"""Linearisations of one row at most."""
+
+STRAIGHT = 0.05**2
+"""In rad²: the variance of a direction below which one does."""
+
 ALIKE = 0.1
 """Ranges that differ by a lesser share of themselves are seen the same way and err together."""
 
@@ -58,14 +64,18 @@ def crowd(rows, listener, range_m):
 
 @numba.njit(cache=True, error_model="numpy")
 def hear(
-    mean, covariance, about, placed, rows, time_s, kind, listener, source, listener_point, source_point, range_m,
-    range_sd_m, bearing_rad, pair, ranges, bearings, share, last_s, believed, flight_s_per_m, speed, used, told, work,
+    mean, covariance, about, follows, placed, rows, time_s, kind, listener, source, listener_point, source_point,
+    range_m, range_sd_m, bearing_rad, pair, ranges, bearings, share, last_s, believed, flight_s_per_m, speed, used,
+    told, work,
 ):  # fmt: skip
     """Take the measurements of some ``rows`` in, in place.
 
     Parameters
     ----------
     mean, covariance, about : float64 (n,), (n, n), (n,)
+    follows : bool
+        Linearise at the mean as it moves instead, and anew about what a row leads to (Bell and Cathey 1993) where its
+        direction is so uncertain that a straight line will not do.
     placed : bool (V,)
         Robots whose place is known; what others heard, or were heard by, is left.
     rows : (first, last)
@@ -75,20 +85,16 @@ def hear(
     used : bool (rows, 2), out
         Range and bearing taken.
     told : float64 (rows, 2, 4), out
-        Of each: what was measured less what was expected (NaN where nothing was), the variance that the belief gave that,
-        the variance of its noise, and that taken for it.
+        Of each: what was measured less what was expected (NaN where nothing was), the variance that the belief gave
+        that, the variance of its noise, and that taken for it.
     work : float64 (3, n)
         Room.
 
-    Returns
-    -------
-    float
-        Sum of squared misses over their expected variances, refused ones as far as they are counted.
     """
     n, robots = len(mean), len(placed)
     row = np.empty((2, n))
+    point, before, doubt = about.copy(), np.empty(n), np.empty((n, n))
     alike = crowd(rows, listener, range_m)
-    total = 0.0
     for i in range(rows[0], rows[1]):
         k = i - rows[0]
         a, b = listener[i], source[i]
@@ -107,47 +113,53 @@ def hear(
             told[k, 1, 0], told[k, 1, 3] = off, variance
             used[k, 1] = True
             continue
-        shown, direction, way = expect(
-            about, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row
-        )
         who = a if a >= 0 else robots
         since = time_s[i] - last_s[pair[i]]
-        wrong = False
-        for j in (1, 0):
-            measured = bearing_rad[i] if j == 1 else range_m[i]
-            if not np.isfinite(measured) or (j == 1 and a < 0):
-                continue
-            off = turned_by(measured - direction) if j == 1 else measured - shown
-            for m in range(n):
-                if row[j, m] != 0.0:
-                    off -= row[j, m] * (mean[m] - about[m])
-            if j == 1:
-                body = (BODY_M / way) ** 2
-                variance = scatter(bearings, who) + body
-                taken = variance - body + body * repeated(MOST_SHARE, since)
-            else:
-                variance = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
-                taken = variance
-                if not believed:
-                    variance += beyond(ranges, who, range_m[i])
-                    taken = variance * repeated(staying(share), since) * alike[k]
-            own = spread(covariance, row[j])
-            square = off * off / (own + taken)
-            told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3] = off, own, variance, taken
-            total += min(square, REFUSED)
-            # a direction that cannot be is that of something else, whose range then tells nothing either
-            if square > REFUSED or wrong:
-                wrong = True
-                continue
-            taken *= max(1.0, np.sqrt(square) / ROBUST)
-            told[k, j, 3] = taken
-            absorb(mean, covariance, row[j], off, taken, work)
-            used[k, j] = True
-    return total
+        if follows:
+            point[:], before[:], doubt[:, :] = mean, mean, covariance
+        for turn in range(TURNS):
+            if turn > 0:
+                point[:], mean[:], covariance[:, :] = mean, before, doubt
+            shown, direction, way = expect(point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            wrong = False
+            for j in (1, 0):
+                used[k, j] = False
+                measured = bearing_rad[i] if j == 1 else range_m[i]
+                if not np.isfinite(measured) or (j == 1 and a < 0):
+                    continue
+                off = turned_by(measured - direction) if j == 1 else measured - shown
+                for m in range(n):
+                    if row[j, m] != 0.0:
+                        off -= row[j, m] * (mean[m] - point[m])
+                if j == 1:
+                    body = (BODY_M / way) ** 2
+                    variance = scatter(bearings, who) + body
+                    taken = variance - body + body * repeated(MOST_SHARE, since)
+                else:
+                    variance = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
+                    taken = variance
+                    if not believed:
+                        variance += beyond(ranges, who, range_m[i])
+                        taken = variance * repeated(staying(share), since) * alike[k]
+                own = spread(covariance, row[j])
+                square = off * off / (own + taken)
+                told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3] = off, own, variance, taken
+                # a direction that cannot be is that of something else, whose range then tells nothing either
+                if square > REFUSED or wrong:
+                    wrong = True
+                    continue
+                taken *= max(1.0, np.sqrt(square) / ROBUST)
+                told[k, j, 3] = taken
+                absorb(mean, covariance, row[j], off, taken, work)
+                used[k, j] = True
+            if not follows or spread(doubt, row[1]) < STRAIGHT or not (used[k, 0] or used[k, 1]):
+                break
 
 
 @numba.njit(cache=True, error_model="numpy")
-def learn(rows, time_s, kind, listener, range_m, range_sd_m, pair, ranges, bearings, share, last_s, last, believed, used, told):
+def learn(
+    rows, time_s, kind, listener, range_m, range_sd_m, pair, ranges, bearings, share, last_s, last, believed, used, told
+):
     """Learn from the measurements just taken in how good such are, in place; arguments as `hear` has them."""
     robots = len(ranges) - 2
     for i in range(rows[0], rows[1]):

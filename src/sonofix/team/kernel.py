@@ -1,7 +1,7 @@
 """The compiled heart of the team's filters: robots driven on by their odometry, and what one is expected to hear.
 
-State vectors are `state.STATES` of each robot in turn. Everything is linearised where ``about`` says: a filter gives its
-mean, a smoother the track of its last pass.
+State vectors are `state.STATES` of each robot in turn. Everything is linearised where ``about`` says: a filter gives
+its mean, a smoother the track of its last pass.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.team.state import BIAS, DRIFT, LAG, OFFSET, SCALE, SIZE, SPEED, TURN, X, Y, YAW
+from sonofix.team.state import BIAS, DRIFT, LAG, OFFSET, SCALE, SIZE, SPEED, TURN, YAW, X, Y
 from sonofix.track.wheels import CREEP_PSD, LONGEST_S, SLIP_M, TWIST_M, TWIST_PSD
 
-ALONG_M = 6e-3
-"""In m²/m: how the place strays along the way for each metre driven; wheels slip along it more than across (`SLIP_M`)."""
+ALONG_M = 1e-2
+"""In m²/m: how the place strays along the way for each metre driven; wheels slip more along it than across."""
 
 TURN_RAD = 2e-2
 """In rad²/rad: how the heading strays for each radian turned."""
@@ -156,8 +156,8 @@ def advance(
 ):  # fmt: skip
     """Drive all robots on, in place; of those not ``placed`` the mean alone moves.
 
-    The mean moves by what ``about`` does, and by its distance from there. ``first`` (V + 1,) says where each robot's rows
-    of odometry begin; ``by`` (V, 3, SIZE), ``noise`` (V, 3, 3) and ``speed`` (V,) are written.
+    The mean moves by what ``about`` does, and by its distance from there. ``first`` (V + 1,) says where each robot's
+    rows of odometry begin; ``by`` (V, 3, SIZE), ``noise`` (V, 3, 3) and ``speed`` (V,) are written.
     """
     n = len(mean)
     robots = len(placed)
@@ -209,8 +209,10 @@ def advance(
 
 @numba.njit(cache=True, error_model="numpy")
 def end_of(about, robot, point, place, by):
-    """Where an end of a row stands: a fixed ``point``, or one at that lever arm on a robot; ``by`` (2,) is its x and y by
-    that robot's yaw."""
+    """Write where an end of a row stands: a fixed ``point``, or one at that lever arm on a robot.
+
+    ``by`` (2,) is its x and y by that robot's yaw.
+    """
     if robot < 0:
         place[0], place[1] = point[0], point[1]
         by[0] = by[1] = 0.0

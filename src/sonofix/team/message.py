@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonofix.records import Floats
-from sonofix.team.state import BIAS, OFFSET, SCALE, X, Y, YAW
+from sonofix.team.state import BIAS, OFFSET, SCALE, YAW, X, Y
 
 SENT = (X, Y, YAW, SCALE, BIAS, OFFSET)
 """States that are told: the pose, and the errors of what the robot hears."""
@@ -44,7 +44,7 @@ class Message:
     covariance, dependent : float64 (6, 6)
         Of these; and the part of it that others may share, since it was told before or came from them.
     measured : float64 (4,)
-        In an answer: range and bearing that it measured of whom it answers, and the variances it takes for them; NaN else.
+        Range and bearing that it measured of whom it answers, and the variances it takes for them; NaN: nothing.
     """
 
     sender: int

@@ -59,7 +59,7 @@ class Noise:
     bearings : float64 (V + 2, 2)
         Count, sum of squares.
     share : float64 (2,)
-        Of ranges: sum of products of successive misses over their noise, and of what these would be if all of it stayed.
+        Of ranges: sum of products of successive misses over their noise, and of what these would be if all stayed.
     last_s, last : float64 (P,), (P, 2, 4)
         When each pair was last used, and what `hear.hear` told of it then; NaN: never.
     believed : bool
@@ -114,7 +114,8 @@ def scatter(bearings, listener):
 def repeated(part, since_s):
     """Return by what a variance is to be multiplied where the pair was used ``since_s`` ago (NaN: never).
 
-    ``part`` of it stays. Of n samples of a process that fades by ρ from one to the next, the mean has (1 + ρ)/(1 − ρ)/n of the variance.
+    ``part`` of it stays. Of n samples of a process that fades by ρ from one to the next, the mean has
+    (1 + ρ)/(1 − ρ)/n of the variance.
     """
     if not np.isfinite(since_s):
         return 1.0
@@ -129,20 +130,21 @@ def staying(share):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def weigh(told):
+def weigh(told, begin):
     """Return what a miss says of its noise's variance, and the weight of that in a maximum of the likelihood.
 
-    ``told`` is the miss, the variance that the belief gave it, and that of its noise.
+    ``told`` is the miss, the variance that the belief gave it, and that of its noise; ``begin`` the latter before
+    anything was learnt, by which it is weighed: by what it is now, one that came out too small would never grow again.
     """
     square = min(told[0] * told[0], CLIPPED * (told[1] + told[2]))
-    return square - told[1], (told[2] / (told[1] + told[2])) ** 2
+    return square - told[1], (begin / (told[1] + begin)) ** 2
 
 
 @numba.njit(cache=True, error_model="numpy")
 def learn_range(ranges, listener, range_m, told, stated):
     """Take in one range, of which variance ``stated`` is stated; ``told`` as `weigh` has it."""
     k = octave(range_m)
-    square, weight = weigh(told)
+    square, weight = weigh(told, BEGIN_SD_M**2 + (SCALE_SD * range_m) ** 2)
     for row in (listener, len(ranges) - 1):
         keep = 1.0 - weight / (REMEMBERED if row == listener else SHARED)
         ranges[row, k, 0] = keep * ranges[row, k, 0] + weight
@@ -153,7 +155,7 @@ def learn_range(ranges, listener, range_m, told, stated):
 @numba.njit(cache=True, error_model="numpy")
 def learn_bearing(bearings, listener, told, body):
     """Take in one bearing, likewise; variance ``body`` is not its listener's."""
-    square, weight = weigh(told)
+    square, weight = weigh(told, BEGIN_SD_RAD**2)
     for row in (listener, len(bearings) - 1):
         keep = 1.0 - weight / (REMEMBERED if row == listener else SHARED)
         bearings[row, 0] = keep * bearings[row, 0] + weight
@@ -164,8 +166,8 @@ def learn_bearing(bearings, listener, told, body):
 def learn_share(share, told, last, since_s):
     """Take in two successive misses of a pair.
 
-    ``told`` (4,), ``last`` (4,): miss, variance that the belief gave it, that of its noise, and the one taken for it. That
-    the latter is more leaves a part of the belief's own error in the next miss, which is not counted.
+    ``told`` (4,), ``last`` (4,): miss, variance that the belief gave it, that of its noise, and the one taken for it.
+    That the latter is more leaves a part of the belief's own error in the next miss, which is not counted.
     """
     fade = np.exp(-since_s / KEPT_S)
     if not fade > 0.1:

@@ -145,7 +145,9 @@ def _starts(clues: Clues) -> list[Floats]:
     for heading in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         yaw = heading + clues.own[:, 2]
         cos, sin = np.cos(heading), np.sin(heading)
-        from_own = np.column_stack([cos * clues.own[:, 0] - sin * clues.own[:, 1], sin * clues.own[:, 0] + cos * clues.own[:, 1]])
+        from_own = np.column_stack(
+            [cos * clues.own[:, 0] - sin * clues.own[:, 1], sin * clues.own[:, 0] + cos * clues.own[:, 1]]
+        )
         if directed.any():
             toward = np.where(clues.listens, yaw + clues.bearing_rad, clues.other[:, 2] + clues.bearing_rad + np.pi)
             there = clues.other[:, :2] - clues.range_m[:, None] * np.column_stack([np.cos(toward), np.sin(toward)])
@@ -153,7 +155,9 @@ def _starts(clues: Clues) -> list[Floats]:
         elif heard.any():
             middle = np.mean(clues.other[heard, :2] - from_own[heard], axis=0)
             reach = float(np.nanmedian(clues.range_m)) if np.isfinite(clues.range_m).any() else 1.0
-            out += [np.array([*(middle + reach * np.array(side)), heading]) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+            out += [
+                np.array([*(middle + reach * np.array(side)), heading]) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))
+            ]
     return out
 
 
@@ -202,7 +206,9 @@ def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
         bearing_by[c] = [0.0, 0.0, 1.0]
         bearing_other[c] = 0.0
     off = off - 2 * np.pi * np.round(off / (2 * np.pi))
-    bearing_sd = np.hypot(np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD), doubt[:, 1] + doubt[:, 0] / np.sqrt(flat))
+    bearing_sd = np.hypot(
+        np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD), doubt[:, 1] + doubt[:, 0] / np.sqrt(flat)
+    )
     told = _told(clues)
     residual = np.concatenate([(r - clues.range_m) / range_sd, off / bearing_sd])
     by = np.vstack([range_by / range_sd[:, None], bearing_by / bearing_sd[:, None]])

@@ -28,17 +28,25 @@ class Recent:
         self._last_s: dict[tuple[int, int], float] = {}
         self._heard_s = np.full(len(feed.robots), -np.inf)
 
-    def add(self, mean: Floats, placed: NDArray[np.bool_], rows: tuple[int, int]) -> None:
-        """Note rows that were heard just now, of robots where a mean has them; V poses, SIZE each."""
-        feed = self._feed
+    def add(
+        self, mean: Floats, placed: NDArray[np.bool_], rows: tuple[int, int], sure: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Note rows that were heard just now, of robots where a mean has them; V poses, SIZE each.
+
+        ``sure``: those that others may go by; None: all that are placed.
+        """
+        feed, sure = self._feed, placed if sure is None else sure
         for i in range(*rows):
             time_s = float(feed.time_s[i])
-            for robot, other in ((int(feed.listener[i]), int(feed.source[i])), (int(feed.source[i]), int(feed.listener[i]))):
+            for robot, other in (
+                (int(feed.listener[i]), int(feed.source[i])),
+                (int(feed.source[i]), int(feed.listener[i])),
+            ):
                 if robot < 0:
                     continue
                 self._heard_s[robot] = time_s
                 key = (int(feed.pair[i]), robot)
-                known = other < 0 or placed[other]
+                known = other < 0 or sure[other]
                 if placed[robot] or not known or time_s - self._last_s.get(key, -np.inf) < APART_S:
                     continue
                 self._last_s[key] = time_s

@@ -67,12 +67,15 @@ def smooth(
     count, n = means.shape
     needed = 8.0 * count * n * n
     if needed > MEMORY_BYTES:
-        raise ValueError(f"{count} moments of {n} states take {needed / 1e9:.1f} GB to smooth; cut the recording in parts")
+        raise ValueError(
+            f"{count} moments of {n} states take {needed / 1e9:.1f} GB to smooth; cut the recording in parts"
+        )
     active, opened = _spans(feed, moments)
     nominal = _whole(feed, moments, means, active)
     variance, taken = _variances(feed, belief.noise)
     judged = None
-    for number in range(passes):
+    blocks, used = np.zeros((len(moments), len(feed.robots), POSE, POSE)), np.zeros((len(feed.time_s), 2), bool)
+    for _ in range(passes):
         smoothed, blocks, used = _pass(feed, moments, nominal, active, opened, taken, judged, on_moment)
         nominal = smoothed
         judged = _judge(feed, moments, nominal, active, variance)
@@ -82,12 +85,21 @@ def smooth(
         pose = nominal[k].reshape(-1, SIZE)[:, :POSE]
         rows = slice(*moment.rows)
         speed = moment.speed_mps
-        out.append(replace(moment, pose=pose.copy(), covariance=blocks[k], placed=active[k].copy(), used=used[rows], speed_mps=speed))
+        out.append(
+            replace(
+                moment,
+                pose=pose.copy(),
+                covariance=blocks[k],
+                placed=active[k].copy(),
+                used=used[rows],
+                speed_mps=speed,
+            )
+        )
     return out
 
 
 def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Floats]:
-    """Return which robots take part at each moment (k, V), and variances (k, V, POSE) by which their poses open then."""
+    """Return which robots take part at each moment (k, V), and by what variances (k, V, POSE) their poses open then."""
     robots = len(feed.robots)
     placed = np.array([moment.placed for moment in moments])
     active, opened = placed.copy(), np.zeros((len(moments), robots, POSE))
@@ -137,7 +149,7 @@ def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray
 
 
 def _variances(feed: Feed, noise: Noise) -> tuple[Floats, Floats]:
-    """Return the variances (rows, 2) of single ranges and bearings, and those to be taken as they come again and again."""
+    """Return the variances (rows, 2) of single ranges and bearings, and those to be taken as they come repeatedly."""
     rows = len(feed.time_s)
     out, taken = np.full((rows, 2), np.nan), np.full((rows, 2), np.nan)
     last = np.full(feed.pairs, np.nan)
@@ -297,7 +309,9 @@ def _back(means, covariances, bys, active, kept, gains, totals, misses, ends, sm
             for i in range(n):
                 adjoint[i] -= row[i] * (pull + misses[m] / totals[m])
                 for j in range(n):
-                    information[i, j] += row[i] * row[j] * (along + 1.0 / totals[m]) - row[i] * told[j] - told[i] * row[j]
+                    information[i, j] += (
+                        row[i] * row[j] * (along + 1.0 / totals[m]) - row[i] * told[j] - told[i] * row[j]
+                    )
         if k == 0:
             break
         for r in range(robots):
@@ -334,7 +348,7 @@ def _back(means, covariances, bys, active, kept, gains, totals, misses, ends, sm
 def _judge(
     feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArray[np.bool_], variance: Floats
 ) -> Floats:
-    """Return weights (rows, 2) of what a track leaves of each measurement; 0: not believed (Huber 1964, and a limit)."""
+    """Return weights (rows, 2) by what a track leaves of each measurement; 0: not believed (Huber 1964, cut off)."""
     weights = np.zeros((len(feed.time_s), 2))
     row = np.empty((2, nominal.shape[1]))
     speed = np.zeros(len(feed.robots))
@@ -347,7 +361,14 @@ def _judge(
                 left = np.array([np.nan, turned_by(feed.bearing_rad[i] - nominal[k, SIZE * a + YAW])])
             else:
                 shown, direction, _ = expect(
-                    nominal[k], a, b, feed.listener_point[i], feed.source_point[i], 1.0 / feed.sound_speed_mps, speed, row
+                    nominal[k],
+                    a,
+                    b,
+                    feed.listener_point[i],
+                    feed.source_point[i],
+                    1.0 / feed.sound_speed_mps,
+                    speed,
+                    row,
                 )
                 left = np.array([feed.range_m[i] - shown, turned_by(feed.bearing_rad[i] - direction)])
             off = np.abs(left) / np.sqrt(variance[i])

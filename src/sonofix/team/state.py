@@ -7,10 +7,21 @@ import numpy as np
 from sonofix.track.stated import BIAS_SD_M, SCALE_SD
 from sonofix.track.wheels import BIAS_PSD, BIAS_SD_RADPS
 
-STATES = ("x", "y", "yaw", "speed_scale", "turn_scale", "turn_bias", "lag", "range_scale", "range_bias", "bearing_offset")
-"""Of one robot, in m and rad: its pose; by what shares of themselves its odometry tells speed and yaw rate too high, and
-the yaw rate that it tells at rest (rad/s); how much later (s) than told its wheels move it; and the errors of what it hears:
-ranges are (1 + range_scale) r + range_bias, bearings bearing_offset too far left."""
+STATES = (
+    "x",
+    "y",
+    "yaw",
+    "speed_scale",
+    "turn_scale",
+    "turn_bias",
+    "lag",
+    "range_scale",
+    "range_bias",
+    "bearing_offset",
+)
+"""Of one robot, in m and rad: its pose; by what shares of themselves its odometry tells speed and yaw rate too high,
+and the yaw rate that it tells at rest (rad/s); how much later (s) than told its wheels move it; and the errors of what
+it hears: ranges are (1 + range_scale) r + range_bias, bearings bearing_offset too far left."""
 
 SIZE = len(STATES)
 X, Y, YAW, SPEED, TURN, DRIFT, LAG, SCALE, BIAS, OFFSET = range(SIZE)
@@ -19,7 +30,7 @@ POSE = 3
 """The first so many are its pose."""
 
 WHEEL_SCALE, WHEEL_SCALE_SD = 0.05, 0.07
-"""Of either scale of odometry: wheels that slip turn further than their robot goes, never less; tyres may differ both ways."""
+"""Of either scale of odometry: wheels that slip turn further than their robot goes; tyres may differ both ways."""
 
 LAG_SD_S = 0.3
 """A controller and its motors take some tenths of a second, unless the wheels themselves are measured."""

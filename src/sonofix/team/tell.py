@@ -46,7 +46,7 @@ def steps_of(feed: Feed, moments: Iterable[Moment], smoothed: bool = False) -> I
         )
         entered = {
             int(robot)
-            for i, taken in zip(range(first, last), moment.used.any(axis=1), strict=True)
+            for i, taken in zip(range(first, last), np.any(moment.used, axis=1).tolist(), strict=True)
             if taken
             for robot in (feed.listener[i], feed.source[i])
         }
