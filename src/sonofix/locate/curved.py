@@ -213,7 +213,8 @@ def least_biases(rows, c, clock, covariance, index, flat, level_m, places, limit
     states, chi2s, jacobians = np.empty((MOST, ALONE)), np.empty(MOST), np.empty((MOST, part_m, count))
     before, known = beforehand(index), np.empty((0, ALONE))
     own, nearest, farthest = np.zeros(n), np.full(n, np.inf), np.zeros(n)
-    for place in places:
+    for p in range(len(places)):
+        place = places[p]
         misfit(rows, c, clock, whiten, index, place, plain, miss, jacobian)
         for i in range(m):
             exact[i] = measured[i] - plain[i]
