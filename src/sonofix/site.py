@@ -317,6 +317,10 @@ class Microphone(_Section):
         yield from _mounting(get, "microphone")
 
 
+MOST_BIAS_M, MOST_BIAS_SD_M = 1000.0, 100.0
+"""Of a pair's ranges; beyond these sums of variances lose the ranges' own."""
+
+
 class Pair(_Section):
     """`[[pair]]`: ranges from beacon `from` to microphone `to` are `bias_m` too long, known to `bias_sd_m`.
 
@@ -327,8 +331,8 @@ class Pair(_Section):
 
     emitter: Id = Field(alias="from")
     receiver: Id = Field(alias="to")
-    bias_m: Number = 0.0
-    bias_sd_m: NotNegative = 0.0
+    bias_m: Annotated[Number, Field(ge=-MOST_BIAS_M, le=MOST_BIAS_M)] = 0.0
+    bias_sd_m: Annotated[NotNegative, Field(le=MOST_BIAS_SD_M)] = 0.0
 
     @classmethod
     def _broken_rules(cls, get: Callable[[str], Any]) -> Iterator[Mistake]:

@@ -174,6 +174,8 @@ def test_a_pairs_bias_is_read_and_written_back():
     ("text", "told"),
     [
         ("bias_m = nan\n", "pair 1 bias_m = nan: must be finite"),
+        ("bias_m = 1e300\n", "pair 1 bias_m = 1e+300: must be less than or equal to 1000"),
+        ("bias_m = 0.1\nbias_sd_m = 1e6\n", "pair 1 bias_sd_m = 1000000.0: must be less than or equal to 100"),
         ("bias_m = 0.1\nbias_sd_m = -0.1\n", "pair 1 bias_sd_m = -0.1: must be greater than or equal to 0"),
         ("bias_m = '0.1'\n", "must be a number"),
         ("", "pair 1 bias_m: the pair tells nothing: give"),

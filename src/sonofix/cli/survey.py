@@ -102,7 +102,6 @@ def survey(
         raise Stopped("stopped; nothing was written") from None
     if found.status == "failed":
         raise ValueError(f"{recording}: no survey: {found.remedy}")
-    _tell(site, found, stated)
     text = writing.corrected_text(read_text(origin, FILE_NAME), source.site, corrected(site, found, not stated))
     try:
         writing.write_site(target, text)
@@ -113,6 +112,8 @@ def survey(
             written.append(picture)
     except KeyboardInterrupt:
         raise Stopped(f"stopped; not all was written beside {target}") from None
+    # told once all is written: whoever reads may leave early
+    _tell(site, found, stated)
     speaker().print(f"\nWritten: {', '.join(map(str, written))}")
 
 

@@ -105,7 +105,7 @@ def survey(
     epochs, told = thinned(epochs)
     # its error is an unknown here, and no noise that ranges share
     epochs = [with_sound_speed(e, e.sound_speed_mps, 0.0) for e in epochs]
-    drive = gather(site, epochs)
+    drive = gather(site, epochs, wishes.biases == "pair")
     fixed = [b for b in site.beacons if b.vehicle is None]
     movable = np.array([i for i, b in enumerate(fixed) if b.position_sd_m > 0 and i in set(drive.point)], np.int64)
     nothing = untellable(drive, len(movable), _task(drive, movable, wishes, fixed).biases)

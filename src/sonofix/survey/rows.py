@@ -104,8 +104,10 @@ class Guess:
     clock: Floats
 
 
-def gather(site: Site, epochs: Sequence[RangeEpoch]) -> Drive:
+def gather(site: Site, epochs: Sequence[RangeEpoch], by_pair: bool = True) -> Drive:
     """Lay the rows of all epochs side by side.
+
+    ``by_pair``: what stays with a pair will be an unknown; else the doubt about it counts as noise of each range.
 
     Raises
     ------
@@ -149,8 +151,9 @@ def gather(site: Site, epochs: Sequence[RangeEpoch]) -> Drive:
                 "dt": epoch.time_s[rows] - middle_s,
                 "time_s": epoch.time_s[rows],
                 "range_m": epoch.range_m[rows],
-                # what stays with a pair is an unknown here, and no noise
-                "range_sd_m": np.sqrt(np.diag(epoch.covariance_m2)[rows] - epoch.bias_m2[rows]),
+                "range_sd_m": np.sqrt(
+                    np.diag(epoch.covariance_m2)[rows] - (epoch.bias_m2[rows] if by_pair else 0.0)
+                ),
                 "rate_mps": nothing if epoch.range_rate_mps is None else epoch.range_rate_mps[rows],
                 "rate_sd_mps": nothing if epoch.range_rate_sd_mps is None else epoch.range_rate_sd_mps[rows],
                 "epoch": np.full(len(rows), index),
