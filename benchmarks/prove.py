@@ -37,7 +37,7 @@ def tables(printed: Sequence[str]) -> list[str]:
 def main() -> None:
     """Run pytest, show what it prints as it comes, and renew the page given."""
     page = Path(sys.argv[1])
-    command = [sys.executable, "-m", "pytest", "-q", "-s", "--no-header", "-m", "prove", "tests/statistics"]
+    command = [sys.executable, "-m", "pytest", "-q", "-s", "--no-header", "-m", "prove", "tests"]
     printed: list[str] = []
     # the receiver's statistics run in processes, a core each: threads of BLAS would only wait for each other
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}

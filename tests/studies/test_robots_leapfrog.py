@@ -44,6 +44,7 @@ def test_a_stop_hears_the_speed_of_sound_and_the_tone_is_what_is_stated() -> Non
     assert bench.tone.amplitude == pytest.approx(10 * robots_stops.BURST_AMPLITUDE)
 
 
+@pytest.mark.prove
 def test_errors_are_as_stated_and_within_a_thousandth_of_the_path(sheet: Sheet) -> None:
     found = named(sheet)
     for case in robots_strip.CASES:
