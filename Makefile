@@ -12,7 +12,7 @@ demo: $(STAMP)  ## simulate a hall, run the receiver on it, show picture and tab
 	$(BIN)/sonofix demo
 
 test: check  ## every check and every test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 check: $(STAMP)
 	$(BIN)/ruff check .
