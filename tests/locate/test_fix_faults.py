@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of, shifted
+from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site, rows_of, shifted
 from sonofix.locate.fix import fix
 
 PLACE = (3.0, 5.5, 1.1)
@@ -32,6 +32,37 @@ def test_one_gross_error_is_left_out_with_an_unknown_clock(rng: np.random.Genera
     found = fix(shifted(make_epoch(site, Drive(PLACE), clock_m=60.0, rng=rng), 4, 0.5), site, "v")
     assert found.status == "ok"
     assert np.flatnonzero(~found.used).tolist() == [4]
+
+
+@pytest.mark.parametrize("level_m", [None, 1.1], ids=["space", "level"])
+@pytest.mark.parametrize("clock_m", [None, 60.0])
+@pytest.mark.parametrize("by_m", [3.0, 30.0, 300.0])
+@pytest.mark.parametrize("rate_sd_mps", [None, 0.01])
+def test_one_range_off_by_far_is_left_out_of_precise_ones(
+    level_m: float | None, clock_m: float | None, by_m: float, rate_sd_mps: float | None, rng: np.random.Generator
+) -> None:
+    # no descent with all of them comes to rest: the bend of a range that is so far off outweighs its slope
+    site = make_site(MANY, level_m=level_m, bounds_m=BOUNDS)
+    for row in range(len(MANY)):
+        place = (*rng.uniform((1, 1), (9, 7)), 1.1)
+        epoch = make_epoch(site, Drive(place), sd_m=0.001, rate_sd_mps=rate_sd_mps, clock_m=clock_m, rng=rng)
+        found = fix(shifted(epoch, row, by_m), site, "v")
+        assert found.status == "ok"
+        assert np.flatnonzero(~found.used).tolist() == [row]
+        error_m = (found.position_m - place)[: 2 if level_m else 3]
+        covariance = found.covariance[: len(error_m), : len(error_m)]
+        assert error_m @ np.linalg.solve(covariance, error_m) < 36
+
+
+@pytest.mark.parametrize("by_m", [30.0, 300.0])
+def test_far_ranges_that_cannot_be_told_apart_have_no_confident_place(by_m: float, rng: np.random.Generator) -> None:
+    site = make_site(HALL, bounds_m=BOUNDS)
+    epoch = make_epoch(site, Drive(PLACE), sd_m=0.001, rng=rng)
+    for row, share in ((0, 1.0), (2, -1.3), (3, 0.7), (5, 1.6)):
+        epoch = shifted(epoch, row, share * by_m)
+    found = fix(epoch, site, "v")
+    assert found.status in ("no-convergence", "inconsistent", "ambiguous")
+    assert found.remedy
 
 
 @pytest.mark.parametrize("faulty", [(1, 6), (0, 4, 9), (2, 3)])

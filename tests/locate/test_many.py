@@ -88,6 +88,32 @@ def test_wrong_ranges_are_left_out_as_by_fix(
     assert told > 0
 
 
+@pytest.mark.parametrize("level_m", [None, 0.4], ids=["space", "level"])
+@pytest.mark.parametrize("clock", [False, True], ids=["clock known", "clock unknown"])
+@pytest.mark.parametrize("by_m", [-3.0, 3.0, 30.0, 300.0])
+def test_a_range_off_by_far_hides_no_precise_place(
+    level_m: float | None, clock: bool, by_m: float, rng: np.random.Generator
+) -> None:
+    places = rng.uniform((1, 1, 0.2), (9, 7, 1.6), (300, 3)) if level_m is None else None
+    if places is None:
+        places = np.column_stack([rng.uniform((1, 1), (9, 7), (300, 2)), np.full(300, level_m)])
+    measured = np.linalg.norm(places[:, None] - ANCHORS, axis=2) + 0.001 * rng.standard_normal((300, len(ANCHORS)))
+    row = rng.integers(0, len(ANCHORS), 300)
+    measured[np.arange(300), row] += by_m
+    measured += 60.0 * clock
+    if not clock:
+        # what is too short stays positive, as a range is
+        measured = np.abs(measured)
+    found = fix_many(ANCHORS, measured, np.full(8, 0.001**2), level_m=level_m, clock=clock, bounds_m=BOUNDS)
+    well = found.status == 0
+    assert np.mean(well) >= 0.99
+    np.testing.assert_array_equal(np.flatnonzero(~found.used[well]) % 8, row[well])
+    away = found.position_m[well] - places[well]
+    away = away[:, : 2 + (level_m is None)]
+    within = np.linalg.solve(found.covariance[well][:, : away.shape[1], : away.shape[1]], away[..., None])[..., 0]
+    assert np.all(np.sum(away * within, axis=1) < 36)
+
+
 def test_scipy_agrees_to_a_micrometre(rng: np.random.Generator) -> None:
     _, measured = ranges(ANCHORS, 60, 1.1, rng)
     found = fix_many(ANCHORS, measured, np.full(8, SD_M**2), level_m=1.1)

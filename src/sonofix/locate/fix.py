@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import PITCH, POSE, ROLL, YAW, Links, from_arm, link, open_arms, tilting
 from sonofix.locate.exclude import agrees, exclude
 from sonofix.locate.rows import ROCKING_RADPS, Rows, Solution
+from sonofix.locate.search import AT_REST
 from sonofix.records import Fix, FixStatus, Floats, RangeEpoch
 from sonofix.site import Site
 
@@ -21,6 +22,8 @@ FLAT_M = 0.01
 
 ONE_HEADING_RAD = 0.1
 """Two solutions whose headings differ by less head alike."""
+
+NO_PLACE = "no position fits; check beacon positions and units"
 
 AMBIGUOUS_CHI2 = 28.0
 """Two solutions whose χ² differ by less are both believed: wherever the two lie, noise prefers the wrong one by more
@@ -75,7 +78,7 @@ def judged(
     everything = np.arange(len(rows))
     found = solver.candidates(everything)
     if not found:
-        return _failed(epoch, vehicle, time_s, "no-convergence", "no position fits; check beacon positions and units")
+        return _failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
     misfit = found[0].chi2
     kept, found, isolated = exclude(solver, everything, found)
     best = found[0]
@@ -84,6 +87,8 @@ def judged(
     inflation = 1.0
     if not agrees(solver, len(kept), best.chi2):
         status, inflation = "inconsistent", best.chi2 / solver.degrees(len(kept))
+        if solver.descends(kept, best) > AT_REST * inflation:
+            return _failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
         remedy = "ranges disagree and no single one explains it; check beacon positions, sound speed and echoes"
     elif not isolated:
         status, inflation = "inconsistent", misfit / solver.degrees(len(rows))

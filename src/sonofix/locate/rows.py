@@ -246,6 +246,10 @@ class Rows:
         without(rows, *at, choices, found.state, states, chi2s)
         return states[:, :3], chi2s
 
+    def descends(self, kept: NDArray[np.int64], found: Solution) -> float:
+        """Return how far χ² falls from a solution on: not at all where it is at rest."""
+        return found.chi2 - float(self.without(kept[None], found)[1][0])
+
     def look(self, kept: NDArray[np.int64], found: Solution) -> tuple[Floats, float | None, float | None]:
         """Residuals (n,) of all rows at a solution, and horizontal and vertical DOP of those kept."""
         residual_m = np.empty(len(self._dt))

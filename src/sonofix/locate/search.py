@@ -32,6 +32,17 @@ NEARLY_FLAT = 0.3
 STEPS = 50
 """Of one descent at most."""
 
+FAR = 100.0
+"""χ² a row beyond which the end of a descent that never rests is a solution, where there is no other.
+
+With a row off by metres Gauss–Newton creeps for ever: misfits times the ranges' curvature outweigh their slopes. Rows
+are left out from there; where that does not mend it, there is no position.
+"""
+
+
+AT_REST = 0.01
+"""χ², in units of what a degree of freedom has, by which a solution at rest falls at most when descended further."""
+
 
 @numba.njit(cache=True, error_model="numpy")
 def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jacobians):
@@ -65,6 +76,7 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
     count, found = begin(anchors, measured[:n], flat, level_m, clock, begins), 0
     scarce = tilts and m < REDUNDANT * len(index)
     plain, miss, jacobian = np.empty(m), np.empty(m), np.empty((m, len(index)))
+    creeping, least = np.empty(ALONE), np.inf
     for b in range(MOST_STARTS + 1):
         if b > count or (b == count and not found):
             break
@@ -91,6 +103,11 @@ def search(rows, c, clock, covariance, index, flat, level_m, states, chi2s, jaco
                 if tilts:
                     _least_turned(state)
                 found = _insert(states, chi2s, found, state, chi2)
+            elif FAR * m < chi2 < least:
+                creeping[:] = state
+                least = chi2
+    if not found and least < np.inf:
+        found = _insert(states, chi2s, 0, creeping, least)
     for lean in range(LEAN_STARTS if scarce and found else 0):
         for j in range(ALONE):
             state[j] = states[0, j]

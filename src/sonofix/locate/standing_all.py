@@ -6,12 +6,14 @@ import numba
 import numpy as np
 
 from sonofix.locate.dense import spread, whitener
+from sonofix.locate.search import AT_REST
 from sonofix.locate.standing import (
     INCONSISTENT,
     MOST,
     OPEN_DIRECTION,
     TOO_FEW,
     choose,
+    descend,
     misfit,
     solutions,
     too_weak,
@@ -90,6 +92,8 @@ def solve_all(anchors, ranges, covariance, each, known, judge, status, state, sp
         inflation = 1.0
         if chi2s[0] > limits[0, len(kept)]:
             inflation = chi2s[0] / (len(kept) - count)
+            if descends(chosen(problem, kept), known, states[0], chi2s[0]) > AT_REST * inflation:
+                continue
         elif not isolated:
             inflation = misfit_of_all / (m - count)
         told = settle(chosen(problem, kept), known, judge, inflation, states, chi2s, found, state[e], spreads[e])
@@ -100,6 +104,13 @@ def solve_all(anchors, ranges, covariance, each, known, judge, status, state, sp
         for i in kept:
             used[e, heard[i]] = True
     return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def descends(rows, known, state, chi2):
+    """How far χ² falls from a solution on: not at all where it is at rest."""
+    places, measured, whiten, work = rows
+    return chi2 - descend(places, measured, whiten, known[3], np.empty((0, 4)), state.copy(), work)[0]
 
 
 @numba.njit(cache=True, error_model="numpy")
