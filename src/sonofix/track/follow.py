@@ -17,8 +17,9 @@ from sonofix.track.bank import Bank
 from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
+from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
-from sonofix.track.update import strangeness, update
+from sonofix.track.update import linear, strangeness, update
 from sonofix.track.wheels import AS_EXPECTED
 
 PATIENCE = 3
@@ -76,6 +77,9 @@ class Follower:
         if inputs is not None and inputs.range_slot >= 0:
             wheeled = np.flatnonzero(inputs.wheel_slot >= 0).tolist()
             self._banks = {who: Bank(self.belief, who) for who in wheeled}
+        alone = len(site.vehicles) == 1 and site.clock_known and inputs is not None and not len(inputs.time_s)
+        few = inputs is not None and 0 <= inputs.range_slot and len(inputs.pairs) <= MOST_PAIRS
+        self._panel = Panel() if alone and few else None
 
     def knowing(self, other: Follower) -> Follower:
         """Return this follower, at its beginning, with what another has learnt of the same recording by its end.
@@ -88,7 +92,7 @@ class Follower:
         covariance = self.belief.covariance.copy()
         stated.open_pairs(covariance, inputs.range_slot, trust)
         self.belief = replace(self.belief, covariance=covariance, trust=trust, rough=other.belief.rough)
-        self.motion, self._banks = other.motion, {}
+        self.motion, self._banks, self._panel = other.motion, {}, None
         return self
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
@@ -142,6 +146,7 @@ class Follower:
         used = self._contest(epoch, links, candidates, used, events)
         self.belief = self._course.head(self.belief)
         self._doubt_wheels(before, epoch, links, candidates, events)
+        self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
@@ -219,7 +224,9 @@ class Follower:
         oppose each other where it is taken as too free (Mehra 1970: innovations of an optimal filter are white).
         """
         inputs = before.inputs
-        if before.trust is None or inputs is None or len(inputs.time_s) or not before.placed.any():
+        if before.trust is None or before.trust.sizes is not None:
+            return
+        if inputs is None or len(inputs.time_s) or not before.placed.any():
             return
         now = (self.belief.pose() - before.pose())[before.placed, 4:6].ravel()
         last, self._pushed = self._pushed, now
@@ -244,6 +251,28 @@ class Follower:
             bank.take(before, self.belief, epoch, links, asked)
             rough[who] = bank.factors
         self.belief = replace(self.belief, rough=rough)
+
+    def _weigh(
+        self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]
+    ) -> None:
+        """Learn how ranges err and how freely a vehicle moves, where others' ranges alone tell of it."""
+        panel, trust = self._panel, self.belief.trust
+        if panel is None or trust is None:
+            return
+        if not self.belief.placed.all() or any(event.event in ("reset", "start") for event in events):
+            panel.forget()
+        if not self.belief.placed.all():
+            return
+        if not panel.begun:
+            panel.begin(self.belief)
+        else:
+            panel.take(before, self.motion, linear(before, epoch, links, asked))
+        if trust.sizes is None and trust.rough_m < ROUGH_M:
+            return  # each pair's errors are as expected, and best learnt by themselves
+        self.belief = replace(self.belief, trust=replace(trust, sizes=panel.sizes))
+        self.motion = replace(self.motion, acceleration_psd=float(panel.sizes[3]))
+        if len(self.belief.mean) == panel.states + 2:
+            self.belief = panel.mixed(self.belief)
 
     def _contest(
         self,
@@ -282,6 +311,11 @@ class Follower:
                     if young and self._rival is not None and self._rival.vehicle == who:
                         self._undecided[who] = True
         return used
+
+    @property
+    def weighs(self) -> bool:
+        """Whether members of other sizes run beside the track."""
+        return self._panel is not None
 
     @property
     def hidden(self) -> frozenset[int]:
@@ -325,6 +359,8 @@ class Follower:
             if self._corrected or self._biased:
                 self.belief = loosen(self.belief, who)
                 self._begun_s[who] = self.belief.time_s
+                if self._corrected and start is found:
+                    taken |= start.used  # with errors open, the very same ranges would only blur their fix
             else:
                 taken |= start.used if start is found else self._touches(links, who)
             x, y, z = start.position_m

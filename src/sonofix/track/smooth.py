@@ -113,7 +113,7 @@ def settle(
         # scale is then told more surely than it is (as in `update`)
         passes = 1
     guide: Guide | None = None
-    before: Follower | None = None
+    before = _scouted(begin, heard)
     for left in reversed(range(passes)):
         follower = begin() if before is None else begin().knowing(before)
         passage = Passage(follower, rate_hz, guide, rows or left > 0)
@@ -131,6 +131,19 @@ def settle(
                 return passage
         guide = following
     raise ValueError(f"passes: {passes}; at least 1 is needed")
+
+
+def _scouted(begin: Callable[[], Follower], heard: Sequence[Heard]) -> Follower | None:
+    """Return a follower that has learnt on a first way through how ranges err and how freely the vehicle moves.
+
+    None where that is not learnt by members (`panel.Panel`), which no chain of knots can tie, or they were not needed.
+    """
+    scout = begin()
+    if not scout.weighs:
+        return None
+    for epoch, fixes in heard:
+        scout.step(epoch, fixes)
+    return scout if scout.belief.trust is not None and scout.belief.trust.sizes is not None else None
 
 
 class FixedLag:

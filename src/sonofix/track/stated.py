@@ -37,6 +37,9 @@ LASTING_S = 300.0
 QUICK_S = 2.0
 """Correlation time of quick errors (multipath along the way)."""
 
+SHARED = 1.5
+"""Where a `panel` weighs sizes, what all pairs share may be so many times as large as what each errs by."""
+
 FREEDOM = 4.0
 """Of Student's t distribution, as which noise is taken: outliers of many metres then weigh next to nothing."""
 
@@ -83,6 +86,9 @@ class Trust:
         How often a pair's error has jumped.
     told : float
         Logarithm of the likelihood of the epoch just taken in.
+    sizes : float64 (4,) or None
+        Those of all pairs that a `panel` has found: slow and quick deviation (m), quick time (s), density of white
+        acceleration (m²/s³); None: each pair's are learnt here.
     """
 
     count: Floats
@@ -95,16 +101,28 @@ class Trust:
     watched_s: Floats
     jumps: int = 0
     told: float = 0.0
+    sizes: Floats | None = None
 
     @property
     def variance(self) -> Floats:
         """Variances (2, P) of each pair's slow and quick errors, in m²."""
+        if self.sizes is not None:
+            return np.repeat(self.sizes[:2, None] ** 2, self.own.shape[1], axis=1)
         return (self.own + POOL * self.pool[:, None]) / (self.weight + POOL)
+
+    @property
+    def every_m2(self) -> float:
+        """Variance that ranges of all pairs have beyond what they state."""
+        return float((self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL))
+
+    @property
+    def rough_m(self) -> float:
+        """Deviation of all that ranges err by, beyond what they state and share."""
+        return float(np.sqrt(max(self.every_m2, 0.0) + self.pool.sum()))
 
     def extra(self, pair: NDArray[np.int64]) -> Floats:
         """Variance (n,) in m² that rows of some pairs have beyond what they state."""
-        every = (self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
-        beyond = self.square[pair] - self.stated[pair] + POOL * every
+        beyond = self.square[pair] - self.stated[pair] + POOL * self.every_m2
         return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
 
     def heard(
@@ -119,7 +137,7 @@ class Trust:
         run[0, pair] = RUN * run[0, pair] + np.clip(miss / np.sqrt(spread), -SINGLE, SINGLE)
         run[1, pair] = RUN**2 * run[1, pair] + 1.0
         jumped = run[0, pair] ** 2 > JUMP * run[1, pair]
-        if 2 * np.count_nonzero(run[0] ** 2 > JUMP / 4 * run[1]) > np.count_nonzero(run[1]):
+        if self.sizes is not None or 2 * np.count_nonzero(run[0] ** 2 > JUMP / 4 * run[1]) > np.count_nonzero(run[1]):
             jumped[:] = False  # it is the vehicle that moved
         run[:, pair[jumped]] = 0.0
         watched_s = self.watched_s.copy()
@@ -130,13 +148,17 @@ class Trust:
     @property
     def lasting_s(self) -> float:
         """Correlation time of slow errors: the time between jumps of one pair, by all pairs (a Poisson process)."""
+        if self.sizes is not None:
+            return LASTING_S
         return (LASTING_S + float(np.nansum(self.watched_s[1] - self.watched_s[0]))) / (1.0 + self.jumps)
 
     def anew(self) -> Trust:
         """Return what another track may begin with: noise as large, soon forgotten; errors as before anything."""
         few = min(1.0, POOL / max(float(self.count[-1]), 1e-9))
         begun = trust(len(self.count) - 1)
-        return replace(begun, count=few * self.count, square=few * self.square, stated=few * self.stated)
+        return replace(
+            begun, count=few * self.count, square=few * self.square, stated=few * self.stated, sizes=self.sizes
+        )
 
     def after(self, pair: NDArray[np.int64], square: Floats, stated: Floats, errors: Floats) -> Trust:
         """Return what is known after another epoch, one expectation-maximisation step on (Särkkä & Nummenmaa 2009).
@@ -203,20 +225,22 @@ def open_pairs(covariance: Floats, slot: int, known: Trust) -> None:
     """Give the errors of pairs the variances that are known of them, in place: before anything was heard."""
     at = np.arange(slot + COMMON, slot + COMMON + known.own.size)
     covariance[at, at] = known.variance.ravel()
-    covariance[slot + 1, slot + 1] = max(BIAS_SD_M**2, known.pool[0])
+    covariance[slot + 1, slot + 1] = max(BIAS_SD_M**2, known.pool[0] if known.sizes is None else (SHARED * known.sizes[1]) ** 2)
 
 
 def wander(mean: Floats, covariance: Floats, slot: int, known: Trust, dt: float) -> None:
     """Let slow and quick errors age by ``dt``, in place (Gelb 1974, section 3.7)."""
     own = slice(slot + COMMON, slot + COMMON + known.own.size)
-    fade = np.repeat(np.exp(-abs(dt) / np.array([known.lasting_s, QUICK_S])), known.own.shape[1])
+    quick_s = QUICK_S if known.sizes is None else float(known.sizes[2])
+    fade = np.repeat(np.exp(-abs(dt) / np.array([known.lasting_s, quick_s])), known.own.shape[1])
     mean[own] *= fade
     covariance[own, :] *= fade[:, None]
     covariance[:, own] *= fade
     at = np.arange(own.start, own.stop)
     covariance[at, at] += known.variance.ravel() * (1.0 - fade**2)
     # where pairs err by more than was expected, so may what they share
-    covariance[slot + 1, slot + 1] += max(known.pool[0] - BIAS_SD_M**2, 0.0) * (1.0 - fade[0] ** 2)
+    if known.sizes is None:
+        covariance[slot + 1, slot + 1] += max(known.pool[0] - BIAS_SD_M**2, 0.0) * (1.0 - fade[0] ** 2)
 
 
 def places(slot: int, pair: NDArray[np.int64], pairs: int) -> NDArray[np.int64]:

@@ -124,6 +124,23 @@ def update(
     return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
 
 
+def linear(
+    belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+    """Return the rows asked as ``offset (r,) = derivative (r, n) x + noise`` of variance (r,), and their pairs (r,).
+
+    Of ranges that others state, without clock; linearised where the belief expects the vehicle.
+    """
+    rows = np.flatnonzero(asked)
+    dt = epoch.time_s[rows] - belief.time_s
+    pair = pairs_of(belief, epoch, rows)
+    variance = noise_of(belief, epoch, links, rows, dt, pair).diagonal()
+    if belief.trust is not None:
+        variance = variance + belief.trust.extra(pair)
+    shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
+    return derivative, epoch.range_m[rows] - shown + derivative @ belief.mean, variance, pair
+
+
 def _bent(belief: Belief, range_m: Floats, variance: Floats) -> bool:
     """Whether ranges bend within what places are uncertain by, by more than a share of what they err by themselves.
 
