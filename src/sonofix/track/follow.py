@@ -78,7 +78,7 @@ class Follower:
             wheeled = np.flatnonzero(inputs.wheel_slot >= 0).tolist()
             self._banks = {who: Bank(self.belief, who) for who in wheeled}
         alone = len(site.vehicles) == 1 and site.clock_known and inputs is not None and not len(inputs.time_s)
-        few = inputs is not None and 0 <= inputs.range_slot and len(inputs.pairs) <= MOST_PAIRS
+        few = inputs is not None and inputs.range_slot >= 0 and len(inputs.pairs) <= MOST_PAIRS
         self._panel = Panel() if alone and few else None
 
     def knowing(self, other: Follower) -> Follower:

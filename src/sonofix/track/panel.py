@@ -236,7 +236,7 @@ class Panel:
         return self._mean.shape[1]
 
     def take(self, belief: Belief, motion: Motion, rows: tuple[Floats, Floats, Floats, NDArray[np.int64]]) -> None:
-        """Take in an epoch's rows as `update.linear` gives them; ``belief`` is the track's, predicted to its instant."""
+        """Take in an epoch's rows (`update.linear`); ``belief`` is the track's, predicted to its instant."""
         inputs = belief.inputs
         assert inputs is not None
         n = self._mean.shape[1]
@@ -244,13 +244,34 @@ class Panel:
         sd = belief.tilts(0)
         tilt, noise = step_of(sd, motion.tilt_pace_radps, dt)
         densities = np.array([motion.climb_psd, motion.turn_psd])
-        go(self._mean, self._covariance, self._free, MEMBERS, dt, densities, tilt, noise,
-           inputs.range_slot, len(inputs.pairs), stated.LASTING_S)
+        go(
+            self._mean,
+            self._covariance,
+            self._free,
+            MEMBERS,
+            dt,
+            densities,
+            tilt,
+            noise,
+            inputs.range_slot,
+            len(inputs.pairs),
+            stated.LASTING_S,
+        )
         self._now_s = belief.time_s
         derivative, offset, variance, pair = rows
         quick = inputs.range_slot + 2 + len(inputs.pairs) + pair
-        hear(self._mean, self._covariance, np.ascontiguousarray(derivative[:, :n]), offset, variance,
-             quick, self._news(pair, belief.time_s), stated.FREEDOM, self._told, self._refused)
+        hear(
+            self._mean,
+            self._covariance,
+            np.ascontiguousarray(derivative[:, :n]),
+            offset,
+            variance,
+            quick,
+            self._news(pair, belief.time_s),
+            stated.FREEDOM,
+            self._told,
+            self._refused,
+        )
         self._told *= np.exp(-abs(dt) / MEMORY_S)
         odds = self._prior + self._told
         self._told = np.maximum(odds, odds.max() - WORST) - self._prior

@@ -225,7 +225,9 @@ def open_pairs(covariance: Floats, slot: int, known: Trust) -> None:
     """Give the errors of pairs the variances that are known of them, in place: before anything was heard."""
     at = np.arange(slot + COMMON, slot + COMMON + known.own.size)
     covariance[at, at] = known.variance.ravel()
-    covariance[slot + 1, slot + 1] = max(BIAS_SD_M**2, known.pool[0] if known.sizes is None else (SHARED * known.sizes[1]) ** 2)
+    covariance[slot + 1, slot + 1] = max(
+        BIAS_SD_M**2, known.pool[0] if known.sizes is None else (SHARED * known.sizes[1]) ** 2
+    )
 
 
 def wander(mean: Floats, covariance: Floats, slot: int, known: Trust, dt: float) -> None:
