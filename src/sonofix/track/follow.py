@@ -257,8 +257,10 @@ class Follower:
     ) -> None:
         """Learn how ranges err and how freely a vehicle moves, where others' ranges alone tell of it."""
         panel, trust = self._panel, self.belief.trust
-        if panel is None or trust is None:
+        if panel is None or trust is None or not asked.any():
             return
+        if panel.silent(before.time_s):
+            panel.forget()
         if not self.belief.placed.all() or any(event.event in ("reset", "start") for event in events):
             panel.forget()
         if not self.belief.placed.all():

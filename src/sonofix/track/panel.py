@@ -2,8 +2,9 @@
 
 Errors that wander and a vehicle that does look alike within seconds; over minutes they do not. So many filters run
 beside the track on the same ranges, each with its own size and time of errors, and freedom of motion. How likely each
-found what was heard weighs it, and where ranges are rough the track is their weighted mean with their scatter (multiple-model estimation: Magill 1965; Bar-Shalom 2001, section 11.6.2). A size that was taken too small at first does
-so not leave a scale or a bias behind that is told more surely than it is: the members that took it larger never were.
+found what was heard weighs it, and where ranges are rough the track is their weighted mean with their scatter
+(multiple-model estimation: Magill 1965; Bar-Shalom 2001, section 11.6.2). A size that was taken too small at first then
+leaves no scale or bias behind that is told more surely than it is.
 """
 
 from __future__ import annotations
@@ -64,6 +65,10 @@ PATIENCE = 3
 MOST_PAIRS = 12
 """Of more, each pair's errors are learnt by itself (`stated`): members cost the square of their number, and so many
 pairs hold each other to the truth."""
+
+SILENT_S = 10.0
+"""After longer silence members begin anew where the track is found: their rows are linearised once, where it expects
+the vehicle."""
 
 ROUGH_M = 0.3
 """Where ranges err by more, several times what is expected of them, the track is what the members hold; else each
@@ -131,7 +136,8 @@ def go(mean, covariance, free, member, dt, densities, tilt, tilt_noise, slot, pa
 def hear(mean, covariance, rows, offset, variance, quick, news, freedom, told, refused):
     """Correct all members by ranges ``offset = rows x + noise``, in place, and add log likelihoods to ``told`` (K,).
 
-    ``news`` (r,) is how much of each row's error is news of its pair; ``quick`` (r,) is where each row's quick error stands; ``refused`` (K, n) counts rows in a row that told nothing.
+    ``news`` (r,) is how much of each row's error is news of its pair; ``quick`` (r,) is where each row's quick error
+    stands; ``refused`` (K, n) counts rows in a row that told nothing.
     """
     n = mean.shape[1]
     work = np.empty(n)
@@ -195,6 +201,10 @@ class Panel:
     def sizes(self) -> Floats:
         """Slow and quick deviation (m), quick time (s), density of acceleration (m²/s³): weighted, as logarithms."""
         return np.exp(self.weight @ np.log(MEMBERS))
+
+    def silent(self, time_s: float) -> bool:
+        """Whether nothing was heard for long."""
+        return self._now_s is not None and time_s - self._now_s > SILENT_S
 
     def forget(self) -> None:
         """Begin anew at the next epoch: the vehicle was placed elsewhere; how likely members are stays."""
