@@ -29,7 +29,8 @@ STATUSES: tuple[FixStatus, ...] = ("ok", "too-few", "no-convergence", "inconsist
 REMEDIES = (
     "",
     "too few ranges; bring more beacons in reach or state what is known (level_m)",
-    "no position fits, or a direction is left open; check the anchors' places and spread them off one line or plane",
+    "no position fits, or a direction is left open; check the anchors' places, spread them off one line or plane, or"
+    " state level_m where all is near one level",
     "ranges disagree, and which is wrong cannot be told; check the anchors' places, sound speed and echoes",
     "two positions fit alike; state the room's bounds_m or the level_m, or move one anchor",
 )
@@ -110,8 +111,8 @@ def fix_many(
     ------
     ValueError
         If what is given is no numbers; shapes do not match; a place, a level or a range is not finite; a range is below
-        0 by more than noise makes it where the clock is known; or the covariance of ranges heard is not positive, finite
-        and symmetric.
+        0 by more than noise makes it where the clock is known; or the covariance of ranges heard is not positive,
+        finite and symmetric.
     """
     anchors = _numbers("anchors_m", anchors_m, "one row of x, y, z an anchor")
     ranges = _numbers("ranges_m", ranges_m, "an epoch a row and an anchor a column, NaN where not heard")
