@@ -1,10 +1,13 @@
 """Surveys of many made drives: deviations are true, whatever is known before."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_drive import HALL, circle, hall, heard, wander
 from scipy.stats import chi2
 
+from sonofix.records import RangeEpoch
 from sonofix.survey.gauge import freedom, laid_upon
 from sonofix.survey.places import Wishes, survey
 
@@ -12,14 +15,19 @@ DRIVES = 50
 PLACES = HALL[[0, 2, 4, 5, 6]]
 
 
-def nees(way, seed: int, known: int, biases: str, count: int) -> tuple[float, int]:
-    """Squared error over covariance of one survey, open rigid motions taken out, and its degrees of freedom."""
+def nees(way, seed: int, known: int, biases: str, count: int, lasting_m: float = 0.0) -> tuple[float, int]:
+    """Squared error over covariance of one survey, open rigid motions taken out, and its degrees of freedom.
+
+    ``lasting_m``: what each pair's ranges err by, the same in all epochs, and the site states as a doubt.
+    """
     rng = np.random.default_rng(seed)
     sd = np.full(len(PLACES), 0.2)
     sd[:known] = 0.0
     site = hall(PLACES + sd[:, None] * rng.standard_normal(PLACES.shape), sd)
     bias = 0.05 * rng.standard_normal(len(PLACES)) if biases == "beacon" else 0.0
     epochs = heard(site, PLACES, way, count, rng, bias_m=bias, period_s=0.9)
+    if lasting_m:
+        epochs = lasting(epochs, lasting_m, rng)
     found = survey(site, epochs, Wishes(biases=biases, bias_sd_m=0.05))
     places = np.array([b.position_m for b in found.beacons])
     target = PLACES if known else laid_upon(PLACES, places, True)
@@ -29,6 +37,20 @@ def nees(way, seed: int, known: int, biases: str, count: int) -> tuple[float, in
     inside = np.linalg.svd(np.hstack([free, np.zeros((len(error), len(error)))]))[0][:, free.shape[1] :]
     error, covariance = inside.T @ error, inside.T @ covariance @ inside
     return float(error @ np.linalg.solve(covariance, error)), len(error)
+
+
+def lasting(epochs: list[RangeEpoch], sd_m: float, rng: np.random.Generator) -> list[RangeEpoch]:
+    """Let each pair's ranges err by one amount throughout, as well known as a site file states it."""
+    error = {f"B{i + 1}": sd_m * rng.standard_normal() for i in range(len(PLACES))}
+    return [
+        replace(
+            epoch,
+            range_m=epoch.range_m + [error[name] for name in epoch.emitter],
+            covariance_m2=epoch.covariance_m2 + np.eye(len(epoch)) * sd_m**2,
+            bias_sd_m=np.full(len(epoch), sd_m),
+        )
+        for epoch in epochs
+    ]
 
 
 LONG = pytest.mark.prove
@@ -42,6 +64,15 @@ def test_errors_are_as_large_as_stated(known: int, biases: str) -> None:
     total, degrees = (sum(part) for part in zip(*totals, strict=True))
     low, high = chi2.ppf([0.0005, 0.9995], degrees)
     # deviations are widened where residuals happen to be large, and never narrowed: some percent of variance
+    assert 0.9 * low < total < high
+
+
+@pytest.mark.parametrize("biases", ["none", "beacon"])
+def test_a_doubt_about_pairs_lasts(biases: str) -> None:
+    # taken for noise that is new in each range, 2 cm would shrink with the root of 20 epochs
+    totals = [nees(wander, seed, 2, biases, 20, lasting_m=0.02) for seed in range(10)]
+    total, degrees = (sum(part) for part in zip(*totals, strict=True))
+    low, high = chi2.ppf([0.0005, 0.9995], degrees)
     assert 0.9 * low < total < high
 
 

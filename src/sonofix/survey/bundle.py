@@ -72,7 +72,7 @@ def _unknowns(task: Task) -> int:
     drive = task.drive
     places = np.where(np.isnan(drive.level_m), 3, 2) + drive.turns
     rates = bool(np.isfinite(drive.rate_mps).any())
-    return int(np.sum(places)) * (2 if rates else 1) + 3 * len(task.movable) + task.biases
+    return int(np.sum(places)) * (2 if rates else 1) + 3 * len(task.movable) + task.asked
 
 
 def _factors(task: Task, guess: Guess, used: NDArray[np.bool_]) -> tuple[float, float]:

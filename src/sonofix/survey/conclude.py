@@ -194,7 +194,7 @@ def _beacons(
             joint[at, at] = np.eye(3) * beacon.position_sd_m**2
         bias = bias_sd = None
         if wishes.biases == "beacon" and mine.any():
-            k = int(task.bias[mine][0])
+            k = int(task.bias[mine][0, 0])
             bias = float(guess.bias_m[k])
             bias_sd = float(np.sqrt(full[3 * len(task.movable) + k, 3 * len(task.movable) + k]))
         out.append(
@@ -221,7 +221,7 @@ def _pairs(task: Task, bias_m: Floats, full: Floats, wishes: Wishes) -> tuple[Pa
     drive, start = task.drive, 3 * len(task.movable)
     single = wishes.biases == "beacon"
     # in one pass from the end, each bias's first row stays
-    first = {int(task.bias[i]): i for i in range(len(drive) - 1, -1, -1) if not single or drive.sends[i]}
+    first = {int(task.bias[i, 0]): i for i in range(len(drive) - 1, -1, -1) if not single or drive.sends[i]}
     sds = np.sqrt(np.diag(full))[start:]
     return tuple(
         PairBias("" if single else drive.emitter[i], drive.receiver[i], float(bias_m[k]), float(sds[k]))
