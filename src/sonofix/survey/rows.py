@@ -59,6 +59,8 @@ class Drive:
     sound_speed_mps : float
         That made the ranges.
     common_clock : bool
+    sd_stated : bool
+        False where ``range_sd_m`` is an assumption, as nobody stated how good ranges are.
     skipped : int
         Rows between vehicles, which a survey does not take.
     """
@@ -86,6 +88,7 @@ class Drive:
     turns: NDArray[np.bool_]
     sound_speed_mps: float
     common_clock: bool
+    sd_stated: bool
     skipped: int
 
     def __len__(self) -> int:
@@ -186,6 +189,7 @@ def gather(site: Site, epochs: Sequence[RangeEpoch]) -> Drive:
         turns=turns[vehicle],
         sound_speed_mps=epochs[0].sound_speed_mps,
         common_clock=epochs[0].clock == "common",
+        sd_stated=all(e.sd_stated for e in epochs),
         skipped=skipped,
         **rest,
     )

@@ -49,6 +49,16 @@ class Task:
         """Number of biases that are asked for: the first ones."""
         return int(self.bias[:, 0].max(initial=-1)) + 1
 
+    @property
+    def poses(self) -> int:
+        """Number of unknowns of all vehicles' poses."""
+        return int(np.sum(np.where(np.isnan(self.drive.level_m), 3, 2) + self.drive.turns))
+
+    @property
+    def followed(self) -> int:
+        """Number of unknowns that ranges must tell: poses, places of movable ends and biases asked for."""
+        return self.poses + 3 * len(self.movable) + self.asked
+
     def shared(self, guess: Guess) -> Floats:
         """Shared unknowns (g,) of a guess."""
         clock = guess.clock if self.drive.common_clock else np.zeros(0)
