@@ -13,6 +13,9 @@ from sonofix.site import Site
 
 SIGHTING, COMPASS = range(2)
 
+BESIDE_M = 0.3
+"""Fixed ends that stand nearer to one another are seen the same way: less than what stands in between is wide."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Feed:
@@ -39,6 +42,8 @@ class Feed:
         NaN where not measured, or not stated.
     pair : int64 (n,)
         Number of its pair of ends.
+    view : int64 (n,)
+        Number of its view: pairs of which one end is the same and the others are fixed within `BESIDE_M` share one.
     ends : tuple of (emitter, receiver), length n
         Ids, as the recording has them.
     own_ranges : bool
@@ -62,6 +67,7 @@ class Feed:
     range_sd_m: Floats
     bearing_rad: Floats
     pair: NDArray[np.int64]
+    view: NDArray[np.int64]
     ends: tuple[tuple[str, str], ...]
     own_ranges: bool
     sound_speed_mps: float
@@ -71,6 +77,11 @@ class Feed:
     def pairs(self) -> int:
         """How many pairs of ends there are."""
         return int(self.pair.max()) + 1 if len(self.pair) else 0
+
+    @property
+    def views(self) -> int:
+        """How many views there are."""
+        return int(self.view.max()) + 1 if len(self.view) else 0
 
     def keep(self, rows: NDArray[np.bool_]) -> Feed:
         """Return the feed with some of its rows alone."""
@@ -87,6 +98,7 @@ class Feed:
                 "range_sd_m",
                 "bearing_rad",
                 "pair",
+                "view",
             )
         }
         return replace(self, **cut, ends=tuple(e for e, kept in zip(self.ends, rows.tolist(), strict=True) if kept))
@@ -150,6 +162,7 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
         range_sd_m=np.array([row[5] for row in rows]),
         bearing_rad=np.array([row[6] for row in rows]),
         pair=np.array([numbers[end] for end in ends], np.int64),
+        view=_views(ends, place),
         ends=ends,
         own_ranges=own_ranges,
         sound_speed_mps=site.sound_speed_mps,
@@ -246,6 +259,26 @@ def _ends(
             who = robots.index(node.vehicle)
             out.append((who, np.array(node.lever_arm_m) + [0.0, 0.0, level_m[who]]))
     return out[0][0], out[1][0], out[0][1], out[1][1]
+
+
+def _views(
+    ends: tuple[tuple[str, str], ...], place: dict[tuple[str, str], tuple[int, int, Floats, Floats]]
+) -> NDArray[np.int64]:
+    """Number the views of rows: single linkage of fixed ends that stand beside one another."""
+    first: dict[tuple[str, str], tuple[str, str]] = {}
+    for end, (listener, source, listener_point, source_point) in place.items():
+        first[end] = end
+        for other, (its_listener, its_source, its_listener_point, its_source_point) in place.items():
+            if other == end:
+                break
+            heard = source < 0 and its_source < 0 and listener >= 0 and end[1] == other[1]
+            hears = listener < 0 and its_listener < 0 and source >= 0 and end[0] == other[0]
+            gap = source_point - its_source_point if heard else listener_point - its_listener_point
+            if (heard or hears) and np.linalg.norm(gap) < BESIDE_M:
+                old, new = first[end], first[other]
+                first = {name: new if root == old else root for name, root in first.items()}
+    numbers = {root: i for i, root in enumerate(dict.fromkeys(first[end] for end in ends))}
+    return np.array([numbers[first[end]] for end in ends], np.int64)
 
 
 def _starts(table: Table | None, robots: tuple[str, ...]) -> dict[int, tuple[float, float, float]]:

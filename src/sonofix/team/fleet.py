@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats
 from sonofix.team.feed import Feed
-from sonofix.team.hear import hear, learn
+from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
-from sonofix.team.state import POSE, SIZE, prior, prior_sd, wander_psd
+from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
 
 START_SD = (0.05, 0.05, 0.1)
 """Of a stated start pose, in m and rad."""
@@ -108,6 +108,10 @@ class Belief:
     placed : bool (V,)
     noise : Noise
     speed : float64 (V,)
+    rough : float64 (V, 3)
+        Factors on the noise of each robot's odometry.
+    last : float64 (W, 2)
+        When each view's error was last followed, and at which range.
     """
 
     mean: Floats
@@ -115,6 +119,8 @@ class Belief:
     placed: NDArray[np.bool_]
     noise: Noise
     speed: Floats
+    rough: Floats
+    last: Floats
     by: Floats = field(init=False)
     drive_noise: Floats = field(init=False)
 
@@ -127,17 +133,20 @@ class Belief:
     def blank(cls, feed: Feed) -> Belief:
         """Return what is believed before anything was heard: nothing but how large errors may be."""
         robots = len(feed.robots)
-        sd = np.tile(prior_sd(feed.own_ranges), robots)
+        views = 0 if feed.own_ranges else feed.views
+        sd = np.concatenate([np.tile(prior_sd(feed.own_ranges), robots), np.ones(views)])
         covariance = np.diag(sd**2)
         for r in range(robots):
             at = slice(SIZE * r, SIZE * r + POSE)
             covariance[at, at] = 0.0
         return cls(
-            np.tile(prior(), robots),
+            np.concatenate([np.zeros(SIZE * robots), np.zeros(views)]),
             covariance,
             np.zeros(robots, bool),
-            noise(robots, feed.pairs, feed.own_ranges),
+            noise(robots, feed.own_ranges),
             np.zeros(robots),
+            np.ones((robots, 4)),
+            np.full((views, 2), np.nan),
         )
 
     def at(self, robot: int) -> slice:
@@ -149,7 +158,7 @@ class Belief:
         psd = wander_psd(feed.own_ranges)
         advance(
             self.mean, self.covariance, self.mean, self.placed, feed.first, feed.odometry_s, feed.odometry,
-            from_s, until_s, psd, self.by, self.drive_noise, self.speed,
+            from_s, until_s, self.rough, psd, self.by, self.drive_noise, self.speed,
         )  # fmt: skip
 
     def hear(self, feed: Feed, rows: tuple[int, int], about: Floats | None = None) -> tuple[NDArray[np.bool_], Floats]:
@@ -159,14 +168,14 @@ class Belief:
         """
         count = rows[1] - rows[0]
         used = np.zeros((count, 2), bool)
-        found = np.full((count, 2, 4), np.nan)
+        found = np.full((count, 2, TOLD), np.nan)
         told = self.noise
         hear(
             self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows,
             feed.time_s, feed.kind, feed.listener, feed.source,
-            feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.pair,
-            told.ranges, told.bearings, told.share, told.last_s, told.believed, 1.0 / feed.sound_speed_mps, self.speed,
-            used, found, np.empty((3, len(self.mean))),
+            feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.view,
+            told.known, told.fading, self.last, told.believed, 1.0 / feed.sound_speed_mps, self.speed, used, found,
+            np.empty((3, len(self.mean))),
         )  # fmt: skip
         return used, found
 
@@ -174,8 +183,7 @@ class Belief:
         """Learn how good measurements are from those just taken in."""
         told = self.noise
         learn(
-            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.pair, told.ranges,
-            told.bearings, told.share, told.last_s, told.last, told.believed, used, found,
+            rows, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, told.known, told.believed, used, found,
         )  # fmt: skip
 
     def put(self, robot: int, found: Placed) -> None:
@@ -263,6 +271,9 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     watch, recent = Watch(len(feed.robots)), Recent(feed)
     for robot, start in feed.starts.items():
         belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
+    from sonofix.team.rough import Rough
+
+    rough = Rough(feed)
     past: deque[_Before] = deque()
     now: float | None = None
     asked_s = left_s = -np.inf
@@ -276,16 +287,22 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             _leave(belief, feed, recent, time_s, events)
         frozen = until_placed and belief.placed.all()
         count = last - first
-        used, told = np.zeros((count, 2), bool), np.full((count, 2, 4), np.nan)
+        used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
         if count and not until_placed:
-            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy()))
+            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy(), belief.last.copy()))
             while time_s - past[0].time_s > REWOUND_S:
                 past.popleft()
+            ends = {int(end) for i in range(*rows) for end in (feed.listener[i], feed.source[i])} - {-1}
+            for robot in ends:
+                rough.take(feed, belief, belief.noise, rows, robot, time_s)
             used, told = belief.hear(feed, rows)
+            for robot in ends:
+                rough.slipped(belief, robot, time_s)
             watch.see(feed, rows, used, told)
             found = watch.astray()
             if found is not None:
                 _reopen(belief, feed, found, watch, recent, past, events)
+                rough.forget(found[0])
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
@@ -324,6 +341,7 @@ class _Before:
     rows: tuple[int, int]
     mean: Floats
     covariance: Floats
+    last: Floats
 
 
 def _reopen(
@@ -346,7 +364,7 @@ def _reopen(
     since = [before for before in past if before.rows[1] > rows[0]]
     at, shift, taken = belief.at(robot), np.zeros(POSE), 0.0
     for _ in range(ITERATED):
-        belief.mean[:], belief.covariance[:] = since[0].mean, since[0].covariance
+        belief.mean[:], belief.covariance[:], belief.last[:] = since[0].mean, since[0].covariance, since[0].last
         belief.loosen(robot, SLIPPED)
         track = belief.mean.copy()
         used: list[bool] = []
