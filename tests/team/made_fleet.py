@@ -6,7 +6,8 @@ import numpy as np
 
 from sonofix.records import RangeRows, Recording, Table
 from sonofix.site import Site
-from sonofix.team.kernel import ALONG_M, SLIP_M, TURN_RAD
+from sonofix.team.state import SLIP_S, SLIP_SD
+from sonofix.track.wheels import SLIP_M, TWIST_M, TWIST_RAD
 
 LANDMARKS = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0))
 
@@ -36,16 +37,18 @@ def fleet(
     for r in range(robots):
         pose = np.array([2.0 + 1.5 * r, 2.0 + (r % 2), rng.uniform(-3, 3)])
         scale, twist, bias = rng.normal(0.05, 0.05), rng.normal(0.05, 0.05), rng.normal(0, 0.005)
+        slips, left = rng.normal(0, SLIP_SD, 2), np.exp(-dt / SLIP_S)
         speed, rate = 0.4, 0.5 + 0.1 * r
         path, told = [], []
         for t in time:
             path.append(pose.copy())
-            told.append((speed / (1 - scale), (rate + bias) / (1 - twist)))
-            along = speed * dt + rng.normal(0, np.sqrt(ALONG_M * speed * dt))
+            told.append((speed / (1 - scale - slips[0]), (rate + bias) / (1 - twist - slips[1])))
+            slips = left * slips + rng.normal(0, SLIP_SD * np.sqrt(1 - left**2), 2)
+            along = speed * dt + rng.normal(0, np.sqrt(SLIP_M * speed * dt))
             across = rng.normal(0, np.sqrt(SLIP_M * speed * dt))
             yaw = pose[2] + rate * dt / 2
             pose = pose + [along * np.cos(yaw) - across * np.sin(yaw), along * np.sin(yaw) + across * np.cos(yaw), 0.0]
-            pose[2] += rate * dt + rng.normal(0, np.sqrt(TURN_RAD * rate * dt))
+            pose[2] += rate * dt + rng.normal(0, np.sqrt((TWIST_RAD * rate + TWIST_M * speed) * dt))
             if pushed is not None and pushed[0] == r and abs(t - pushed[1]) < dt / 2:
                 pose[:2] += pushed[2]
         truth.append(np.array(path))

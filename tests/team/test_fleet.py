@@ -4,7 +4,7 @@ import pytest
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
 from sonofix.team.fleet import follow
-from sonofix.team.message import BYTES, Message, unpack
+from sonofix.team.message import BYTES, TOLD, Message, unpack
 from sonofix.team.smooth import smooth
 from sonofix.team.tell import steps_of
 from team.made_fleet import errors, fleet, nees
@@ -132,10 +132,10 @@ def test_decentralised_is_never_overconfident_nor_surer_than_all_at_once():
 
 def test_messages_come_through_and_are_small():
     rng = np.random.default_rng(0)
-    root = rng.normal(size=(6, 6))
-    sent = Message(3, 12.5, rng.normal(size=6), root @ root.T, 0.5 * root @ root.T, np.array([1.0, 0.2, 0.01, 1e-4]))
+    root = rng.normal(size=(TOLD, TOLD))
+    sent = Message(3, 12.5, rng.normal(size=TOLD), root @ root.T, 0.5 * root @ root.T, np.array([1.0, 0.2, 0.01, 1e-4]))
     packet = sent.pack()
-    assert len(packet) == BYTES < 256
+    assert len(packet) == BYTES < 300
     got = unpack(packet)
     assert (got.sender, got.time_s) == (3, 12.5)
     np.testing.assert_allclose(got.mean, sent.mean, rtol=1e-6)

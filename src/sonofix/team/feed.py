@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sonofix.records import Floats, RangeRows, Recording, Table
 from sonofix.site import Site
+from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
 
 SIGHTING, COMPASS = range(2)
 
@@ -28,8 +29,9 @@ class Feed:
         Height of each robot's origin.
     first : int64 (V + 1,)
         Where each robot's rows of odometry begin.
-    odometry_s, odometry : float64 (k,), (k, 2)
-        Their times; speed (m/s) and yaw rate (rad/s), held until the robot's next row.
+    odometry_s, odometry : float64 (k,), (k, 3)
+        Their times; speed (m/s) and yaw rate (rad/s), held until the robot's next row; and the variance (rad²) of what
+        it may have turned unseen before that: one that drives off from rest, where a compass tells its heading.
     time_s : float64 (n,)
         When each row was heard, in order.
     kind : int64 (n,)
@@ -123,13 +125,14 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
     site = recording.site
     robots = tuple(vehicle.id for vehicle in site.vehicles)
     level = np.array([vehicle.z_m or 0.0 for vehicle in site.vehicles])
-    first, odometry_s, odometry = _odometry(recording.tables.get("odometry"), robots)
+    compass = recording.tables.get("compass")
+    headed = () if compass is None else compass.names.get("vehicle") or robots[:1]
+    first, odometry_s, odometry = _odometry(recording.tables.get("odometry"), robots, frozenset(headed))
     if not len(odometry_s):
         raise ValueError("odometry.csv: a team is carried by the odometry of its robots, and there is none")
     rows = _sightings(ranges if ranges is not None else recording.ranges, recording.tables.get("bearings"))
     if not rows:
         raise ValueError("ranges.csv, bearings.csv: neither has a row, so no robot can be placed")
-    compass = recording.tables.get("compass")
     if compass is not None:
         whose = compass.names.get("vehicle") or (robots[0],) * len(compass.columns["time_s"])
         told = compass.columns
@@ -185,15 +188,21 @@ def heard_by(feed: Feed, landmarks_of: Iterable[str] | None = None, peers: bool 
     return feed.keep(keep)
 
 
-def _odometry(table: Table | None, robots: tuple[str, ...]) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Rows of odometry, robot by robot."""
+def _odometry(
+    table: Table | None, robots: tuple[str, ...], headed: frozenset[str]
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Rows of odometry, robot by robot; ``headed``: those of which a compass tells the heading."""
     if table is None:
-        return np.zeros(len(robots) + 1, np.int64), np.zeros(0), np.zeros((0, 2))
+        return np.zeros(len(robots) + 1, np.int64), np.zeros(0), np.zeros((0, 3))
     time_s = table.columns["time_s"]
     whose = np.array(table.names.get("vehicle") or (robots[0],) * len(time_s))
-    told = np.column_stack([table.columns["v_mps"], table.columns["yaw_rate_radps"]])
+    told = np.column_stack([table.columns["v_mps"], table.columns["yaw_rate_radps"], np.zeros(len(time_s))])
     parts = [np.flatnonzero(whose == robot) for robot in robots]
     parts = [rows[np.argsort(time_s[rows], kind="stable")] for rows in parts]
+    for robot, rows in zip(robots, parts, strict=True):
+        stands = np.abs(told[rows, 0]) < STANDING_MPS
+        if robot in headed:
+            told[rows[1:], 2] = np.where(stands[:-1] & ~stands[1:], UNSEEN_RAD**2, 0.0)
     order = np.concatenate(parts)
     first = np.concatenate([[0], np.cumsum([len(rows) for rows in parts])]).astype(np.int64)
     return first, np.ascontiguousarray(time_s[order]), np.ascontiguousarray(told[order])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats
-from sonofix.team.feed import Feed
+from sonofix.team.feed import SIGHTING, Feed
 from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
@@ -227,27 +227,36 @@ class Watch:
         self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
 
     def clear(self, robot: int) -> None:
-        """Forget what was refused."""
+        """Forget what was refused of a robot, by others too: they are not to blame."""
         self._latest[robot].clear()
+        for latest in self._latest:
+            kept = [one for one in latest if one[1] != robot]
+            latest.clear()
+            latest.extend(kept)
 
     def see(self, feed: Feed, rows: tuple[int, int], used: NDArray[np.bool_], told: Floats) -> None:
         """Note what became of some measurements."""
         for k, i in enumerate(range(*rows)):
             asked = np.isfinite(told[k, :, 0])
-            for robot in {int(feed.listener[i]), int(feed.source[i])} - {-1}:
-                if feed.kind[i] == 0 and asked.any():
-                    self._latest[robot].append((i, int(feed.pair[i]), bool(np.all(used[k][asked]))))
+            if feed.kind[i] != SIGHTING or not asked.any():
+                continue
+            ends = int(feed.listener[i]), int(feed.source[i])
+            for robot, other in (ends, ends[::-1]):
+                if robot >= 0:
+                    # fixed ends are told apart by their pair
+                    partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
+                    self._latest[robot].append((i, partner, bool(np.all(used[k][asked]))))
 
     def astray(self) -> tuple[int, list[int]] | None:
         """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
 
-        These are the latest of each pair; None: there is no such robot, or too little to find it by.
+        These are the latest of each partner; None: there is no such robot, or too little to find it by.
         """
         worst: tuple[float, int, list[int]] | None = None
         for robot, latest in enumerate(self._latest):
             if len(latest) < 4:
                 continue
-            refused = {pair: row for row, pair, ok in latest if not ok}
+            refused = {partner: row for row, partner, ok in latest if not ok}
             share = sum(not ok for _, _, ok in latest) / len(latest)
             if len(refused) >= 2 and share >= 0.6 and (worst is None or share > worst[0]):
                 worst = share, robot, sorted(refused.values())

@@ -30,8 +30,8 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     ----------
     own : float64 (SIZE,)
         The robot's state at ``from_s``.
-    time_s, told : float64 (k,), (k, 2)
-        Rows of its odometry: speed and yaw rate.
+    time_s, told : float64 (k,), (k, 3)
+        Rows of its odometry: speed, yaw rate, and the variance of what it may have turned unseen before.
     from_s, until_s : float
     rough : float64 (3,)
         Factors on what `track.wheels` has its place and heading stray by, and its errors wander.
@@ -108,6 +108,7 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
         now = until
         if i + 1 < n and now >= time_s[i + 1]:
             i += 1
+            heading += told[i, 2]
     dx, dy = x - own[X], y - own[Y]
     pose[0], pose[1], pose[2] = x, y, yaw
     by[:, :] = 0.0

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from sonofix.records import Floats
-from sonofix.track.stated import BEGIN_SD_M, POOL, SCALE_SD
+from sonofix.track.stated import BEGIN_SD_M, LASTING_S, POOL, SCALE_SD
 
 OCTAVES = 8
 """Of range, the fourth of which begins at 1 m."""
@@ -28,8 +28,6 @@ LEAST = 1e-4
 BEGIN_SHARE = 0.5
 """The part of a range's variance that stays, before measurements have told."""
 
-KEPT_S = 60.0
-"""How long a view lasts: a body in between, an echo's way, a side that is seen."""
 
 KEPT_SHARE = 0.5
 """By what share of itself a range changes until its view is another."""
@@ -64,7 +62,7 @@ class Noise:
 
 def noise(robots: int, believed: bool) -> Noise:
     """Return what is known before anything was heard."""
-    return Noise(np.zeros((robots + 2, OCTAVES, KINDS, 2)), believed, np.array([KEPT_S, KEPT_SHARE]))
+    return Noise(np.zeros((robots + 2, OCTAVES, KINDS, 2)), believed, np.array([LASTING_S, KEPT_SHARE]))
 
 
 @numba.njit(cache=True, error_model="numpy")
