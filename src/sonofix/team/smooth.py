@@ -291,7 +291,7 @@ def _hear(
 
 @numba.njit(cache=True, error_model="numpy")
 def _back(
-    means, covariances, bys, active, times, rows, view, errors, kept, gains, totals, misses, ends, smoothed, blocks,
+    means, covariances, bys, active, times, heard, view, errors, kept, gains, totals, misses, ends, smoothed, blocks,
 ):  # fmt: skip
     """Smooth backwards: x − P λ and P − P Λ P, with λ and Λ carried back over measurements and drives."""
     count, n = means.shape
@@ -331,7 +331,7 @@ def _back(
                     )
         if k == 0:
             break
-        for i in range(rows[k, 0], rows[k, 1]):
+        for i in range(heard[k, 0], heard[k, 1]):
             if errors[i, LEFT] < 1.0:
                 at = SIZE * robots + view[i]
                 adjoint[at] *= errors[i, LEFT]
