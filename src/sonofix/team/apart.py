@@ -54,7 +54,7 @@ class Apart:
         self.feed = feed
         self.belief = Belief.blank(feed)
         self.dependent = np.zeros_like(self.belief.covariance)
-        self._noise: list[Noise] = [noise(len(feed.robots), feed.own_ranges) for _ in feed.robots]
+        self._noise: list[Noise] = [noise(len(feed.robots), feed.views, feed.own_ranges) for _ in feed.robots]
         self.rough = Rough(feed)
         robots = len(feed.robots)
         owner = np.full(0 if feed.own_ranges else feed.views, -1)
@@ -134,8 +134,8 @@ class Apart:
         measured = np.full(4, np.nan)
         measured[:2] = self.feed.range_m[row], self.feed.bearing_rad[row]
         if np.isfinite(measured[0]):
-            measured[2] = variance_of(told.known, listener, NEW, measured[0])
-        measured[3] = variance_of(told.known, listener, BEARING, measured[0])
+            measured[2] = variance_of(told.known, listener, NEW, measured[0]) * told.swell[listener, 0]
+        measured[3] = variance_of(told.known, listener, BEARING, measured[0]) * told.swell[listener, 1]
         for end in (listener, source):
             self.rough.take(self.feed, self.belief, told, (row, row + 1), end, time_s)
         self._age(row, told)

@@ -143,7 +143,7 @@ class Belief:
             np.concatenate([np.zeros(SIZE * robots), np.zeros(views)]),
             covariance,
             np.zeros(robots, bool),
-            noise(robots, feed.own_ranges),
+            noise(robots, feed.views, feed.own_ranges),
             np.zeros(robots),
             np.ones((robots, 4)),
             np.full((views, 2), np.nan),
@@ -174,7 +174,7 @@ class Belief:
             self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows,
             feed.time_s, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.view,
-            told.known, told.fading, self.last, told.believed, 1.0 / feed.sound_speed_mps, self.speed, used, found,
+            told.known, told.fading, told.swell, self.last, told.believed, 1.0 / feed.sound_speed_mps, self.speed, used, found,
             np.empty((3, len(self.mean))),
         )  # fmt: skip
         return used, found
@@ -183,7 +183,8 @@ class Belief:
         """Learn how good measurements are from those just taken in."""
         told = self.noise
         learn(
-            rows, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, told.known, told.believed, used, found,
+            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.view, told.known, told.runs,
+            told.swell, told.believed, used, found,
         )  # fmt: skip
 
     def put(self, robot: int, found: Placed) -> None:

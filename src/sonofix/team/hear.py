@@ -7,7 +7,7 @@ import numpy as np
 
 from sonofix.team.feed import COMPASS
 from sonofix.team.kernel import expect, turned_by
-from sonofix.team.noise import BEARING, CLIPPED, NEW, STAYING, fade, take, variance_of
+from sonofix.team.noise import BEARING, CLIPPED, NEW, STAYING, fade, follow_run, take, variance_of
 from sonofix.team.state import SIZE, YAW
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
@@ -53,7 +53,7 @@ def age(mean, covariance, at, left):
 @numba.njit(cache=True, error_model="numpy")
 def hear(
     mean, covariance, about, follows, placed, rows, time_s, kind, listener, source, listener_point, source_point,
-    range_m, range_sd_m, bearing_rad, view, known, fading, last, believed, flight_s_per_m, speed, used, told, work,
+    range_m, range_sd_m, bearing_rad, view, known, fading, swell, last, believed, flight_s_per_m, speed, used, told, work,
 ):  # fmt: skip
     """Take the measurements of some ``rows`` in, in place.
 
@@ -138,7 +138,7 @@ def hear(
                     variance = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
                     if not believed:
                         variance += variance_of(known, who, NEW, range_m[i])
-                taken = variance
+                taken = variance if believed else variance * swell[who, j]
                 own = spread(covariance, row[j])
                 square = off * off / (own + taken)
                 told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3] = off, own, variance, taken
@@ -158,7 +158,9 @@ def hear(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def learn(rows, kind, listener, range_m, range_sd_m, known, believed, used, told):
+def learn(
+    rows, time_s, kind, listener, range_m, range_sd_m, view, known, runs, swell, believed, used, told
+):  # fmt: skip
     """Learn from the measurements just taken in how good such are, in place; arguments as `hear` has them."""
     robots = len(known) - 2
     for i in range(rows[0], rows[1]):
@@ -170,7 +172,9 @@ def learn(rows, kind, listener, range_m, range_sd_m, known, believed, used, told
             if not used[k, j] or (j == 0 and believed):
                 continue
             off, own, variance, taken = told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3]
-            part = taken / (own + taken)
+            if not believed:
+                swell[who, j] = follow_run(runs[view[i], j], swell[who, j], time_s[i], off / np.sqrt(own + taken))
+            part = variance / (own + variance)
             square = min((off * part) ** 2, CLIPPED * variance) + own * part
             if j == 1:
                 take(known, who, BEARING, range_m[i], square, 1.0)

@@ -35,6 +35,15 @@ KEPT_SHARE = 0.5
 REMEMBERED = 200.0
 """Measurements of a listener by which their scatter is judged; of all listeners ten times as many."""
 
+RUN_S = 20.0
+"""How long innovations of one view are summed up."""
+
+SWELLS = 0.1
+"""How fast variances follow, per run."""
+
+SWOLLEN = 100.0
+"""At most."""
+
 CLIPPED = 9.0
 """A single square counts as at most so many variances."""
 
@@ -51,6 +60,12 @@ class Noise:
     ----------
     known : float64 (V + 2, OCTAVES, KINDS, 2)
         Faded count, and sum of squares over the variance taken in the beginning; last row: of all listeners.
+    runs : float64 (W, 2, 3)
+        Of each view, ranges and bearings: when its run of innovations began, their sum, over their deviations, and how
+        many they are.
+    swell : float64 (V + 1, 2)
+        By what factor the variance of what is new of a listener's ranges and bearings is to be taken larger, as
+        innovations do not average out as they should.
     believed : bool
         Ranges are as good as stated, and nothing of them stays.
     """
@@ -58,11 +73,13 @@ class Noise:
     known: Floats
     believed: bool
     fading: Floats
+    runs: Floats
+    swell: Floats
 
 
-def noise(robots: int, believed: bool) -> Noise:
+def noise(robots: int, views: int, believed: bool) -> Noise:
     """Return what is known before anything was heard."""
-    return Noise(np.zeros((robots + 2, OCTAVES, KINDS, 2)), believed, np.array([LASTING_S, KEPT_SHARE]))
+    return Noise(np.zeros((robots + 2, OCTAVES, KINDS, 2)), believed, np.array([LASTING_S, KEPT_SHARE]), np.full((views, 2, 3), np.nan), np.ones((robots + 1, 2)))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -108,3 +125,21 @@ def take(known, listener, kind, range_m, square, weight):
         keep = 1.0 - weight / (REMEMBERED if row == listener else 10.0 * REMEMBERED)
         known[row, k, kind, 0] = keep * known[row, k, kind, 0] + weight
         known[row, k, kind, 1] = keep * known[row, k, kind, 1] + weight * ratio
+
+
+@numba.njit(cache=True, error_model="numpy")
+def follow_run(run, swell, time_s, miss):
+    """Take an innovation, over its deviation, into its view's ``run`` (3,); at its end let ``swell`` follow.
+
+    Innovations of a filter whose noise is what it is taken for are white: their sums have the variances of as many
+    (Mehra 1970). Where sums are larger, errors stay in ways that no state describes, and many tell as much as few.
+    """
+    if np.isfinite(run[0]) and time_s - run[0] > RUN_S:
+        ratio = min(run[1] ** 2 / run[2], CLIPPED)
+        swell = min(max(swell * np.exp(SWELLS * (ratio - 1.0)), 1.0), SWOLLEN)
+        run[0] = np.nan
+    if not np.isfinite(run[0]):
+        run[0], run[1], run[2] = time_s, 0.0, 0.0
+    run[1] += miss
+    run[2] += 1.0
+    return swell

@@ -39,7 +39,7 @@ LEAST = 1e-4
 @numba.njit(cache=True, error_model="numpy")
 def weigh(
     mean, covariance, chances, robot, rows, kind, listener, source, listener_point, source_point, range_m,
-    range_sd_m, bearing_rad, view, time_s, known, fading, last, believed, flight_s_per_m, speed, placed, about, doubt,
+    range_sd_m, bearing_rad, view, time_s, known, fading, swell, last, believed, flight_s_per_m, speed, placed, about, doubt,
 ):  # fmt: skip
     """Correct the members (K, SIZE), (K, SIZE, SIZE) of one robot by some rows; add log likelihoods to ``chances`` (K,).
 
@@ -80,13 +80,13 @@ def weigh(
                     continue
                 if j == 1:
                     off = turned_by(measured - direction)
-                    variance = variance_of(known, who, BEARING, range_m[i])
+                    variance = variance_of(known, who, BEARING, range_m[i]) * (1.0 if believed else swell[who, 1])
                 else:
                     off = measured - shown - missed
                     variance = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
                     variance += staying
                     if not believed:
-                        variance += variance_of(known, who, NEW, range_m[i])
+                        variance += variance_of(known, who, NEW, range_m[i]) * swell[who, 0]
                 if other >= 0:
                     for m in range(SIZE):
                         for q in range(SIZE):
@@ -155,7 +155,7 @@ class Rough:
             weigh(
                 mean, covariance, chances, robot, rows, feed.kind, feed.listener, feed.source, feed.listener_point,
                 feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.view, feed.time_s, known.known,
-                known.fading, belief.last, known.believed, 1.0 / feed.sound_speed_mps, belief.speed, belief.placed,
+                known.fading, known.swell, belief.last, known.believed, 1.0 / feed.sound_speed_mps, belief.speed, belief.placed,
                 belief.mean, belief.covariance,
             )  # fmt: skip
             chances -= chances.max()

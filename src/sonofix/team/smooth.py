@@ -167,9 +167,10 @@ def _errors(feed: Feed, noise: Noise) -> Floats:
         view, who, range_m = feed.view[i], int(feed.listener[i]), float(feed.range_m[i])
         listener = who if who >= 0 else len(feed.robots)
         out[i, 0] = feed.range_sd_m[i] ** 2 if np.isfinite(feed.range_sd_m[i]) else 0.0
-        out[i, 1] = variance_of(noise.known, listener, BEARING, range_m)
+        swell = (1.0, 1.0) if noise.believed else noise.swell[listener]
+        out[i, 1] = variance_of(noise.known, listener, BEARING, range_m) * swell[1]
         if not noise.believed and np.isfinite(range_m):
-            out[i, 0] += variance_of(noise.known, listener, NEW, range_m)
+            out[i, 0] += variance_of(noise.known, listener, NEW, range_m) * swell[0]
             out[i, STAYS] = np.sqrt(variance_of(noise.known, listener, STAYING, range_m))
             out[i, LEFT] = fade(feed.time_s[i] - last[view, 0], range_m, last[view, 1], noise.fading)
             last[view] = feed.time_s[i], range_m
