@@ -17,6 +17,7 @@ from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
+from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
 
 START_SD = (0.05, 0.05, 0.1)
@@ -174,8 +175,8 @@ class Belief:
             self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows,
             feed.time_s, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.view,
-            told.known, told.fading, told.swell, self.last, told.believed, 1.0 / feed.sound_speed_mps, self.speed, used, found,
-            np.empty((3, len(self.mean))),
+            told.known, told.fading, told.swell, self.last, told.believed, 1.0 / feed.sound_speed_mps, self.speed, used,
+            found, np.empty((3, len(self.mean))),
         )  # fmt: skip
         return used, found
 
@@ -183,8 +184,8 @@ class Belief:
         """Learn how good measurements are from those just taken in."""
         told = self.noise
         learn(
-            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.view, told.known, told.runs,
-            told.swell, told.believed, used, found,
+            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.view, told.known,
+            told.runs, told.swell, told.believed, used, found,
         )  # fmt: skip
 
     def put(self, robot: int, found: Placed) -> None:
@@ -281,8 +282,6 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     watch, recent = Watch(len(feed.robots)), Recent(feed)
     for robot, start in feed.starts.items():
         belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
-    from sonofix.team.rough import Rough
-
     rough = Rough(feed)
     past: deque[_Before] = deque()
     now: float | None = None

@@ -53,7 +53,8 @@ def age(mean, covariance, at, left):
 @numba.njit(cache=True, error_model="numpy")
 def hear(
     mean, covariance, about, follows, placed, rows, time_s, kind, listener, source, listener_point, source_point,
-    range_m, range_sd_m, bearing_rad, view, known, fading, swell, last, believed, flight_s_per_m, speed, used, told, work,
+    range_m, range_sd_m, bearing_rad, view, known, fading, swell, last, believed, flight_s_per_m, speed, used, told,
+    work,
 ):  # fmt: skip
     """Take the measurements of some ``rows`` in, in place.
 

@@ -9,7 +9,23 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.team.state import BIAS, DRIFT, LAG, OFFSET, SCALE, SIZE, SLIP_S, SLIP_SD, SPEED, SPEED_SLIP, TURN, TURN_SLIP, YAW, X, Y
+from sonofix.team.state import (
+    BIAS,
+    DRIFT,
+    LAG,
+    OFFSET,
+    SCALE,
+    SIZE,
+    SLIP_S,
+    SLIP_SD,
+    SPEED,
+    SPEED_SLIP,
+    TURN,
+    TURN_SLIP,
+    YAW,
+    X,
+    Y,
+)
 from sonofix.track.wheels import CREEP_PSD, LONGEST_S, SLIP_M, TWIST_M, TWIST_PSD, TWIST_RAD
 
 STRAYS = 2
@@ -23,7 +39,7 @@ UNTOLD_PSD = 0.1
 def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     """Drive a robot on along its odometry, each row of which holds until the next or for `LONGEST_S`.
 
-    With k, l, b the errors of speed, yaw rate and its zero, a row (v, w) moves it on an arc at (1 − k) v and
+    With k, l, b the errors of speed, yaw rate and its zero, slips included, a row (v, w) moves it on an arc at (1 − k) v and
     ω = (1 − l) w − b; what is told at t happens at t + lag.
 
     Parameters
@@ -33,8 +49,8 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     time_s, told : float64 (k,), (k, 3)
         Rows of its odometry: speed, yaw rate, and the variance of what it may have turned unseen before.
     from_s, until_s : float
-    rough : float64 (3,)
-        Factors on what `track.wheels` has its place and heading stray by, and its errors wander.
+    rough : float64 (4,)
+        Factors on the variances that `track.wheels` has its place and heading stray by; the rest is not for here.
     pose : float64 (3,), out
         x, y, yaw at ``until_s``.
     by : float64 (3, SIZE), out
@@ -150,7 +166,8 @@ def advance(
     """Drive all robots on, in place; of those not ``placed`` the mean alone moves.
 
     The mean moves by what ``about`` does, and by its distance from there. ``first`` (V + 1,) says where each robot's
-    rows of odometry begin; ``rough`` (V, 3) is as `drive` has it; ``by`` (V, 3, SIZE), ``noise`` (V, 3, 3) and ``speed`` (V,) are written.
+    rows of odometry begin; ``rough`` (V, 4) has two factors as `drive` has them, and those on the variances of slips;
+    ``by`` (V, 3, SIZE), ``noise`` (V, 3, 3) and ``speed`` (V,) are written.
     """
     n = len(mean)
     robots = len(placed)

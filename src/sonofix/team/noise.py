@@ -60,6 +60,8 @@ class Noise:
     ----------
     known : float64 (V + 2, OCTAVES, KINDS, 2)
         Faded count, and sum of squares over the variance taken in the beginning; last row: of all listeners.
+    fading : float64 (2,)
+        How long, in s, an error stays, and for what change of range, as a share of that.
     runs : float64 (W, 2, 3)
         Of each view, ranges and bearings: when its run of innovations began, their sum, over their deviations, and how
         many they are.
@@ -79,7 +81,13 @@ class Noise:
 
 def noise(robots: int, views: int, believed: bool) -> Noise:
     """Return what is known before anything was heard."""
-    return Noise(np.zeros((robots + 2, OCTAVES, KINDS, 2)), believed, np.array([LASTING_S, KEPT_SHARE]), np.full((views, 2, 3), np.nan), np.ones((robots + 1, 2)))
+    return Noise(
+        np.zeros((robots + 2, OCTAVES, KINDS, 2)),
+        believed,
+        np.array([LASTING_S, KEPT_SHARE]),
+        np.full((views, 2, 3), np.nan),
+        np.ones((robots + 1, 2)),
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -110,7 +118,7 @@ def variance_of(known, listener, kind, range_m):
 
 @numba.njit(cache=True, error_model="numpy")
 def fade(since_s, range_m, last_m, fading):
-    """Return which part of an error that stays is left of the one ``since_s`` ago at ``last_m``; NaN: there was none."""
+    """Return which part is left of a staying error of ``since_s`` ago at ``last_m``; NaN: there was none."""
     if not np.isfinite(since_s):
         return 0.0
     return np.exp(-max(since_s, 0.0) / fading[0] - abs(range_m - last_m) / (fading[1] * max(range_m, 1e-6)))

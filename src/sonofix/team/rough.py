@@ -13,7 +13,6 @@ from itertools import product
 import numba
 import numpy as np
 
-from sonofix.records import Floats
 from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.fleet import Belief
 from sonofix.team.kernel import advance, expect, turned_by
@@ -72,7 +71,9 @@ def weigh(
             staying *= 1.0 - left * left + left * left * doubt[at, at]
         for k in range(len(mean)):
             both[:SIZE] = mean[k]
-            shown, direction, _ = expect(both, here, there, listener_point[i], source_point[i], flight_s_per_m, fast, row)
+            shown, direction, _ = expect(
+                both, here, there, listener_point[i], source_point[i], flight_s_per_m, fast, row
+            )
             before = mean[k].copy()
             for j in (1, 0):
                 measured = bearing_rad[i] if j == 1 else range_m[i]
@@ -90,9 +91,7 @@ def weigh(
                 if other >= 0:
                     for m in range(SIZE):
                         for q in range(SIZE):
-                            variance += (
-                                row[j, SIZE + m] * doubt[SIZE * other + m, SIZE * other + q] * row[j, SIZE + q]
-                            )
+                            variance += row[j, SIZE + m] * doubt[SIZE * other + m, SIZE * other + q] * row[j, SIZE + q]
                 total = variance
                 for m in range(SIZE):
                     off -= row[j, m] * (mean[k, m] - before[m])

@@ -377,9 +377,7 @@ def _back(
                         information[m, at + j] += by[i, j] * carried[i, m]
 
 
-def _judge(
-    feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArray[np.bool_], errors: Floats
-) -> Floats:
+def _judge(feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArray[np.bool_], errors: Floats) -> Floats:
     """Return weights (rows, 2) by what a track leaves of each measurement; 0: not believed (Huber 1964, cut off)."""
     weights = np.zeros((len(feed.time_s), 2))
     row = np.empty((2, nominal.shape[1]))
