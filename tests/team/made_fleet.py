@@ -29,8 +29,8 @@ def fleet(
 
     ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: a robot,
     when, and how far; ``staying_m``: by how much ranges of one pair err besides, always the same; ``beside``: each
-    landmark has another beside it, heard with the same such error;
-    ``strays``: a factor on the variance of how places stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as `sonofix.team.kernel` has it.
+    landmark has another beside it, heard with the same such error; ``strays``: a factor on the variance of how places
+    stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as `sonofix.team.kernel` and `.state` have it.
     """
     rng = np.random.default_rng(seed)
     silent, dt = silent or {}, 0.1
@@ -77,11 +77,9 @@ def fleet(
                     continue
                 delta = place - truth[to][k, :2]
                 bearing = np.arctan2(delta[1], delta[0]) - truth[to][k, 2]
-                noise = rng.normal(0, 0.05), rng.normal(0, 0.01)
+                noise = rng.normal(0, 0.05) + errs[to, view], rng.normal(0, 0.01)
                 if np.hypot(*delta) < 6.0:
-                    rows.append(
-                        (time[k], name, f"R{to}", np.hypot(*delta) + noise[0] + errs[to, view], bearing + noise[1])
-                    )
+                    rows.append((time[k], name, f"R{to}", np.hypot(*delta) + noise[0], bearing + noise[1]))
     site = Site.model_validate(
         {
             "format": 1,

@@ -39,8 +39,8 @@ UNTOLD_PSD = 0.1
 def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     """Drive a robot on along its odometry, each row of which holds until the next or for `LONGEST_S`.
 
-    With k, l, b the errors of speed, yaw rate and its zero, slips included, a row (v, w) moves it on an arc at (1 − k) v and
-    ω = (1 − l) w − b; what is told at t happens at t + lag.
+    With k, l, b the errors of speed, yaw rate and its zero, slips included, a row (v, w) moves it on an arc at
+    (1 − k) v and ω = (1 − l) w − b; what is told at t happens at t + lag.
 
     Parameters
     ----------

@@ -9,18 +9,21 @@ which is a state: by its expected square, a step of expectation-maximisation an 
 from __future__ import annotations
 
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
 from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import Belief
 from sonofix.team.kernel import advance, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
 from sonofix.team.state import SIZE, SLIP_S, SLIP_SD, SPEED_SLIP, TURN_SLIP, wander_psd
 from sonofix.track.bank import MEMORY_S, PRIOR_DECADES
 from sonofix.track.kernel import absorb
 from sonofix.track.stated import FREEDOM
+
+if TYPE_CHECKING:
+    from sonofix.team.fleet import Belief
 
 DECADES = (-2, -1, 0, 1, 2)
 """Powers of ten by which members multiply the variances of place, and of heading."""
@@ -38,11 +41,12 @@ LEAST = 1e-4
 @numba.njit(cache=True, error_model="numpy")
 def weigh(
     mean, covariance, chances, robot, rows, kind, listener, source, listener_point, source_point, range_m,
-    range_sd_m, bearing_rad, view, time_s, known, fading, swell, last, believed, flight_s_per_m, speed, placed, about, doubt,
+    range_sd_m, bearing_rad, view, time_s, known, fading, swell, last, believed, flight_s_per_m, speed, placed, about,
+    doubt,
 ):  # fmt: skip
-    """Correct the members (K, SIZE), (K, SIZE, SIZE) of one robot by some rows; add log likelihoods to ``chances`` (K,).
+    """Correct the members (K, SIZE), (K, SIZE, SIZE) of one robot by rows; add log likelihoods to ``chances`` (K,).
 
-    Other robots, and errors of pairs, are as ``about`` and ``doubt``, the team's mean and covariance before these rows,
+    Other robots, and errors of views, are as ``about`` and ``doubt``, the team's mean and covariance before these rows,
     have them. Noise is Student's t, of `FREEDOM`. The rest is as `hear.hear` has it.
     """
     robots = len(placed)
@@ -154,8 +158,8 @@ class Rough:
             weigh(
                 mean, covariance, chances, robot, rows, feed.kind, feed.listener, feed.source, feed.listener_point,
                 feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.view, feed.time_s, known.known,
-                known.fading, known.swell, belief.last, known.believed, 1.0 / feed.sound_speed_mps, belief.speed, belief.placed,
-                belief.mean, belief.covariance,
+                known.fading, known.swell, belief.last, known.believed, 1.0 / feed.sound_speed_mps, belief.speed,
+                belief.placed, belief.mean, belief.covariance,
             )  # fmt: skip
             chances -= chances.max()
             chances *= np.exp(-(now_s - since_s) / MEMORY_S)
