@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measure import table
-from sonofix import flow
+from sonofix import flow, receiver
 from sonofix.acquire.baseband import downconvert
 from sonofix.acquire.plan import Plan
 from sonofix.acquire.search import search
@@ -89,11 +89,11 @@ def main() -> None:
     rows = []
     for take in takes:
         after = result(read_recording(take))
-        whole, flow.acquire = flow.acquire, peaks
+        whole, receiver.acquire = receiver.acquire, peaks
         try:
             before = result(read_recording(take))
         finally:
-            flow.acquire = whole
+            receiver.acquire = whole
         rows.append((f"{take.parent.name} {take.name}", *before.cells, *after.cells))
     columns = ("take", "fixes before", "ranges", "residual rms", "fixes after", "ranges", "residual rms")
     table("Model cars in real rooms: what fixes rest on, and what they leave", columns, rows)

@@ -1,4 +1,9 @@
-"""Run the long statistics and put the tables they print into docs/statistics.md, if all hold."""
+"""Run the long statistics and put the tables they print into docs/statistics.md, if all hold.
+
+    python benchmarks/prove.py docs/statistics.md [TESTS …]
+
+With tests named, those alone are run and only their tables are renewed.
+"""
 
 from __future__ import annotations
 
@@ -34,10 +39,18 @@ def tables(printed: Sequence[str]) -> list[str]:
     return blocks
 
 
+def renewed(page: str, blocks: Sequence[str], whole: bool) -> str:
+    """Return the page with these blocks: in place of all, or of those that begin with the same line; new ones last."""
+    head, mark, rest = page.partition(MARK)
+    by_line = {} if whole else {block.partition("\n")[0]: block for block in tables(rest.splitlines())}
+    by_line |= {block.partition("\n")[0]: block for block in blocks}
+    return head + mark + "\n" + "\n\n".join(by_line.values()) + "\n"
+
+
 def main() -> None:
-    """Run pytest, show what it prints as it comes, and renew the page given."""
-    page = Path(sys.argv[1])
-    command = [sys.executable, "-m", "pytest", "-q", "-s", "--no-header", "-m", "prove", "tests"]
+    """Run pytest on all tests, or on those named, show what it prints as it comes, and renew the page given."""
+    page, asked = Path(sys.argv[1]), sys.argv[2:]
+    command = [sys.executable, "-m", "pytest", "-q", "-s", "--no-header", "-m", "prove", *(asked or ["tests"])]
     printed: list[str] = []
     # the receiver's statistics run in processes, a core each: threads of BLAS would only wait for each other
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ}
@@ -48,8 +61,7 @@ def main() -> None:
             printed.append(line)
     if running.returncode:
         sys.exit(running.returncode)
-    text = page.read_text("utf-8")
-    page.write_text(text[: text.index(MARK) + len(MARK)] + "\n" + "\n\n".join(tables(printed)) + "\n", "utf-8")
+    page.write_text(renewed(page.read_text("utf-8"), tables(printed), whole=not asked), "utf-8")
 
 
 if __name__ == "__main__":

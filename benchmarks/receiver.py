@@ -265,7 +265,8 @@ def whole_run(length_s: float = 120.0, turns: int = 3) -> None:
 
 def _parts(folder: Path) -> dict[str, float]:
     """Time the parts of a run in this process, s, each call of them counted."""
-    from sonofix import files, flow
+    from sonofix import files, flow, receiver
+    from sonofix.street import Street
 
     spent = {"reading": 0.0, "receiver": 0.0, "fixes and track": 0.0, "writing": 0.0}
 
@@ -279,13 +280,13 @@ def _parts(folder: Path) -> dict[str, float]:
 
         return timed
 
-    before = flow.acquire, flow.Street.walk
-    flow.acquire, flow.Street.walk = counted("receiver", before[0]), counted("fixes and track", before[1])
+    before = receiver.acquire, Street.walk
+    receiver.acquire, Street.walk = counted("receiver", before[0]), counted("fixes and track", before[1])
     try:
         recording = files.read_recording(folder)
         steps = list(flow.run(recording))
     finally:
-        flow.acquire, flow.Street.walk = before
+        receiver.acquire, Street.walk = before
     assert recording.blocks is not None
     blocks = recording.blocks
     spent["reading"] = once(lambda: sum(1 for _ in blocks(RATE_HZ)))

@@ -12,7 +12,8 @@ import pytest
 from sonofix import score
 from sonofix.channel import Circle, Line, Still, simulate
 from sonofix.files import read_recording, write_recording
-from sonofix.flow import Receiver, run
+from sonofix.flow import run
+from sonofix.receiver import Receiver
 from sonofix.records import RangeRows, Recording, Step, Truth
 from sonofix.signals import codes
 from sonofix.signals.waveform import waveforms_of

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sonofix.channel import Line, simulate
-from sonofix.flow import Receiver, run
+from sonofix.flow import run
+from sonofix.receiver import Receiver
 from sonofix.records import Recording, Step, Truth
 from sonofix.signals import codes
 from sonofix.signals.waveform import waveforms_of

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from sonofix.channel import simulate
     from sonofix.draw.track import draw_track
     from sonofix.files import RecordingError, read_recording, read_site, read_truth, write_recording, write_run
-    from sonofix.flow import Receiver, run, smoothed
+    from sonofix.flow import run, smoothed
+    from sonofix.receiver import Receiver
     from sonofix.score import score_ranges, score_track
 
 __all__ = [
@@ -39,7 +40,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Receiver": "sonofix.flow",
+    "Receiver": "sonofix.receiver",
     "RecordingError": "sonofix.files",
     "draw_track": "sonofix.draw.track",
     "read_recording": "sonofix.files",

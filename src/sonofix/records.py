@@ -769,8 +769,8 @@ class Quality:
     sd_m, sd_z_m : float64 (ny, nx)
         Expected deviation of the position, √(σx² + σy²), and of the height; NaN and None likewise.
     fault_m : float64 (ny, nx)
-        Smallest fault of one range that is detected whichever range it is in; infinite where none is surely detected,
-        NaN where there is no fix.
+        Smallest fault of one range that is detected whichever range it is in, by the linear model (ranges taken as
+        straight near the place); infinite where none is detected, NaN where there is no fix.
     """
 
     x_m: Floats

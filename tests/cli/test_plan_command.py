@@ -75,13 +75,13 @@ def test_the_table_holds_every_place_and_the_figures(store) -> None:
     assert {row["z_m"] for row in table} == {"0.400"}
     inside = [r for r in table if 4 < float(r["x_m"]) < 13 and r["y_m"] in ("3.000", "8.000")]
     assert inside
-    assert all(r["heard"] == r["sd_m"] == r["fault_m"] == "" for r in inside)
+    assert all(r["heard"] == r["sd_m"] == r["fault_linear_m"] == "" for r in inside)
     floor = [r for r in table if r["heard"]]
     fixed = [r for r in floor if r["sd_m"]]
     assert figure(output, "floor with a fix") == [f"{100 * len(fixed) / len(floor):.1f} %"]
     assert all(int(r["heard"]) >= 2 and float(r["hdop"]) > 0.5 for r in fixed)
     assert all(r["vdop"] == r["sd_z_m"] == "" for r in floor)
-    assert all(int(r["heard"]) >= 3 for r in floor if r["fault_m"])
+    assert all(int(r["heard"]) >= 3 for r in floor if r["fault_linear_m"])
     assert not (store / "p" / "improved.toml").exists()
 
 

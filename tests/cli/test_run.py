@@ -85,6 +85,19 @@ def test_ranges_in_everything_out(tmp_path):
     assert f"Written to {out}" in told.stdout
 
 
+def test_an_open_height_asks_for_the_level(tmp_path):
+    site = hall()
+    site["vehicle"] = [{"id": "agv"}]
+    site["beacon"] = [{"id": name, "position_m": (x, y, 0.4)} for name, (x, y, _) in CORNERS.items()]
+    ways = [np.hypot(3.0 - x, 2.5 - y) for x, y, _ in CORNERS.values()]
+    rows = RangeRows(np.zeros(5), tuple(CORNERS), ("M1",) * 5, np.array(ways), np.full(5, 0.1))
+    write_recording(tmp_path / "flat", Recording(Site.model_validate(site), ranges=rows))
+    told = runner.invoke(app, ["run", str(tmp_path / "flat")])
+    assert told.exit_code == 0
+    assert "1 epoch without a sound fix: beacons and vehicle near one level leave the height open" in told.output
+    assert "z_m of its [[vehicle]]" in told.output
+
+
 def test_samples_in_positions_out(tmp_path):
     site = Site.model_validate(hall())
     waveforms = waveforms_of(site)

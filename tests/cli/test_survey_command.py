@@ -282,3 +282,10 @@ def test_biases_of_pairs_are_found_written_and_taken_off_again(tmp_path) -> None
     assert told.exit_code == 0, told.stderr
     both = [np.array([p.bias_m for p in read_site(path).pairs]) for path in (out, again)]
     np.testing.assert_allclose(both[0], both[1], atol=0.003)
+    # a scale found beside them has no place in the file, and that is said
+    assert "too long. A site file states that" not in told.output
+    freed = ["survey", str(folder), "--biases", "pair", "--sound-speed-sd", "3", "--no-plot"]
+    told = runner.invoke(app, [*freed, "-o", str(tmp_path / "freed.toml")])
+    assert told.exit_code == 0, told.stderr
+    text = " ".join(told.output.split())
+    assert "% too long. A site file states that for times of flight alone ([air] sound_speed_mps)" in text

@@ -84,7 +84,7 @@ def test_the_maps_are_named_and_show_the_values(free) -> None:
     figure = draw_quality(quality, BEACONS, WALLS, title="store")
     titles = [axes.get_title("left") for axes in figure.axes if axes.get_title("left")]
     assert titles[:2] == ["Beacons heard", "HDOP"]
-    assert titles[-1] == "Fault surely detected"
+    assert titles[-1] == "Fault detected"
     assert ("VDOP" in titles) == ("Expected deviation of the height" in titles) == free
     assert len(titles) == (6 if free else 4)
     shown = {axes.get_title("left"): axes.images[-1].get_array() for axes in figure.axes if axes.get_title("left")}
@@ -107,7 +107,7 @@ def test_the_legend_names_what_is_shown_and_nothing_else() -> None:
         return [text.get_text() for text in draw_quality(*args, title="", **more).legends[0].get_texts()]
 
     plain = names(made(False), BEACONS, Walls.none())
-    assert plain == ["beacon", "no fix there, or no fault surely detected"]
+    assert plain == ["beacon", "no fix there, or no fault detected"]
     full = names(made(False), BEACONS, WALLS, added=["B1"], moved={"B2": np.zeros(3)})
     assert full == [
         "beacon",
@@ -116,14 +116,14 @@ def test_the_legend_names_what_is_shown_and_nothing_else() -> None:
         "obstacle",
         "wall to the ceiling",
         "lower wall",
-        "no fix there, or no fault surely detected",
+        "no fix there, or no fault detected",
     ]
 
 
 def test_a_floor_without_any_fix_says_so() -> None:
     told = words(draw_quality(made(False, fix=False), BEACONS, WALLS, title="store"))
     assert told.count("no fix anywhere") == 2
-    assert "no fault is surely detected anywhere" in told
+    assert "no fault is detected anywhere" in told
 
 
 def test_one_place_and_one_beacon_are_drawn() -> None:

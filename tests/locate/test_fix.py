@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site, rows_of
-from sonofix.locate.fix import fix
+from sonofix.locate.fix import OPEN_DIRECTION, OPEN_HEIGHT, fix
 from sonofix.records import Fix, Floats
 from sonofix.site import Site
 
@@ -169,3 +169,24 @@ def test_ranges_between_vehicles_are_left_to_the_track() -> None:
     check_ok(found, PLACE)
     assert found.used.tolist() == [True] * 6 + [False] * 2
     assert fix(epoch, site, "w").status == "too-few"
+
+
+ON_A_LEVEL = [(0, 0, 1.04), (7, 0, 1.05), (7, 6, 1.04), (0, 6, 1.045), (3.5, 0, 1.04), (7, 3, 1.043)]
+
+
+@pytest.mark.parametrize("clock_m", [None, 3.0])
+def test_a_height_that_beacons_on_its_level_leave_open_asks_for_the_level(clock_m: float | None) -> None:
+    place = (3.1, 2.2, 1.043)
+    open_site = make_site(ON_A_LEVEL)
+    found = fix(make_epoch(open_site, Drive(place), clock_m=clock_m, sd_m=0.07), open_site, "v")
+    assert (found.status, found.remedy) == ("no-convergence", OPEN_HEIGHT)
+    assert "z_m of its [[vehicle]]" in found.remedy
+    # and that is what helps
+    site = make_site(ON_A_LEVEL, level_m=place[2])
+    check_ok(fix(make_epoch(site, Drive(place), clock_m=clock_m, sd_m=0.07), site, "v"), place)
+
+
+def test_a_direction_on_the_level_that_is_open_asks_for_no_level() -> None:
+    site = make_site([(1.0 + 2 * i, 3.0, 0.5 + 2 * (i % 2)) for i in range(6)])  # all on one wall
+    found = fix(make_epoch(site, Drive((4.3, 3.0, 1.4)), sd_m=0.2), site, "v")
+    assert (found.status, found.remedy) == ("no-convergence", OPEN_DIRECTION)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site
@@ -181,9 +182,12 @@ def changed(values: Floats, at: tuple, to: float) -> Floats:
         (ANCHORS, np.ones((3, 8)), changed(np.ones(8), (2,), np.inf), "epoch 0, anchor 2 is inf"),
         (ANCHORS, np.ones((3, 8)), np.ones((8, 8)), "positive definite"),
         (ANCHORS, np.ones((3, 8)), changed(np.eye(8), (0, 1), 0.2), "not symmetric"),
+        ("B1", np.ones((3, 8)), np.ones(8), "anchors_m 'B1': give numbers, one row"),
+        (ANCHORS, [[1.0] * 8, [1.0]], np.ones(8), r"ranges_m \[\[1.0, .*: give numbers, an epoch a row"),
+        (ANCHORS, np.ones((3, 8)), np.full(8, 1j), "covariance_m2 array.*: give numbers"),
     ],
 )
-def test_misuse_is_named(anchors: Floats, measured: Floats, covariance: Floats, word: str) -> None:
+def test_misuse_is_named(anchors: ArrayLike, measured: ArrayLike, covariance: ArrayLike, word: str) -> None:
     with pytest.raises(ValueError, match=word):
         fix_many(anchors, measured, covariance)
 
@@ -194,7 +198,11 @@ def test_misuse_is_named(anchors: Floats, measured: Floats, covariance: Floats, 
         ({"bounds_m": [[1, 1, 1], [0, 0, 0]]}, "bounds_m"),
         ({"bounds_m": [[0, 0, np.nan], [1, 1, 1]]}, "bounds_m"),
         ({"bounds_m": [0, 0, 0]}, "bounds_m"),
+        ({"bounds_m": "hall"}, "bounds_m 'hall': give numbers, two corners"),
         ({"level_m": np.nan}, "level_m nan"),
+        ({"level_m": "x"}, "level_m 'x': give numbers, a finite level, or None"),
+        ({"level_m": "1.5"}, "level_m '1.5': give numbers"),
+        ({"level_m": [0.0, 1.0]}, r"level_m \[0.0, 1.0\]: give a finite level"),
     ],
 )
 def test_a_room_or_level_that_is_none_is_named(asked: dict, word: str) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from locate.made_epochs import Drive, make_epoch, make_site
-from sonofix.flow import Street
 from sonofix.records import Floats, Table
+from sonofix.street import Street
 from sonofix.track import wheels
 
 MEADOW = make_site(((-46.0, 11.0, 0.0), (11.0, -7.0, 0.0), (22.0, 24.0, 0.0), (-18.0, 59.0, 0.0)), level_m=0.0)

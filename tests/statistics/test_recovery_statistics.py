@@ -17,9 +17,9 @@ import pytest
 from numpy.typing import NDArray
 
 from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site, rows_of
-from sonofix.flow import Street
 from sonofix.records import Floats, Table
 from sonofix.site import Site
+from sonofix.street import Street
 
 PERIOD_S = 0.5
 LEVEL_M = 0.5

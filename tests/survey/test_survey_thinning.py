@@ -62,7 +62,23 @@ def test_ranges_that_err_alike_count_for_fewer(rho: float, factor: float) -> Non
         white, last = rng.standard_normal(len(rows)), 0.0
         for i, row in enumerate(rows):
             last = z[row] = rho * last + np.sqrt(1 - rho**2) * white[i]
-    assert alike(task, z, np.ones(len(task), bool)) == pytest.approx(factor, rel=0.25, abs=0.06)
+    used = np.ones(len(task), bool)
+    got = alike(task, z, used, 0)
+    assert got == pytest.approx(factor, rel=0.25, abs=0.06)
+    # of what residuals show, unknowns that follow took their share before
+    assert alike(task, z, used, len(task) // 2) - 1.0 == pytest.approx(2.0 * (got - 1.0))
+
+
+def test_where_nobody_states_how_good_ranges_are_residuals_do() -> None:
+    sds = []
+    for assumed_m, stated in ((0.02, True), (0.1, False)):
+        epochs = drive(60, 0.3, np.random.default_rng(3), range_sd_m=0.02)
+        noisy = [replace(e, covariance_m2=np.eye(len(e)) * assumed_m**2, sd_stated=stated) for e in epochs]
+        sds.append(np.array([p.sd_m for p in survey(KNOWN, noisy, Wishes(biases="pair", speed_sd_mps=0.0)).pairs]))
+    assert sds[1] == pytest.approx(sds[0], rel=0.25)
+    # what is stated is not made smaller
+    told = [replace(e, sd_stated=True) for e in noisy]
+    assert all(p.sd_m > 2 * sds[0].max() for p in survey(KNOWN, told, Wishes(biases="pair", speed_sd_mps=0.0)).pairs)
 
 
 def test_deviations_of_biases_hold_where_errors_last() -> None:

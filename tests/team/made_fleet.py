@@ -6,7 +6,8 @@ import numpy as np
 
 from sonofix.records import RangeRows, Recording, Table
 from sonofix.site import Site
-from sonofix.team.kernel import ALONG_M, SLIP_M, TURN_RAD
+from sonofix.team.state import SLIP_S, SLIP_SD
+from sonofix.track.wheels import SLIP_M, TWIST_M, TWIST_RAD
 
 LANDMARKS = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0))
 
@@ -20,32 +21,42 @@ def fleet(
     shift_m: tuple[float, float] = (0.0, 0.0),
     silent: dict[int, tuple[float, float]] | None = None,
     pushed: tuple[int, float, float] | None = None,
+    staying_m: float = 0.0,
+    beside: bool = False,
+    strays: float = 1.0,
 ) -> tuple[Recording, dict[str, np.ndarray]]:
     """Return a recording and, of each robot, true rows (time, x, y, yaw).
 
     ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: a robot,
-    when, and how far. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as `sonofix.team.kernel` has it.
+    when, and how far; ``staying_m``: by how much ranges of one pair err besides, always the same; ``beside``: each
+    landmark has another beside it, heard with the same such error; ``strays``: a factor on the variance of how places
+    stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as `sonofix.team.kernel` and `.state` have it.
     """
     rng = np.random.default_rng(seed)
     silent, dt = silent or {}, 0.1
     time = np.arange(0.0, seconds, dt)
     cos, sin = np.cos(turned_rad), np.sin(turned_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
-    landmarks = np.array(LANDMARKS) @ turn.T + shift_m
+    stand = np.array(LANDMARKS)
+    if beside:
+        stand = np.vstack([stand, stand + [0.1, 0.1]])
+    landmarks = stand @ turn.T + shift_m
     truth, odometry = [], []
     for r in range(robots):
         pose = np.array([2.0 + 1.5 * r, 2.0 + (r % 2), rng.uniform(-3, 3)])
         scale, twist, bias = rng.normal(0.05, 0.05), rng.normal(0.05, 0.05), rng.normal(0, 0.005)
+        slips, left = rng.normal(0, SLIP_SD, 2), np.exp(-dt / SLIP_S)
         speed, rate = 0.4, 0.5 + 0.1 * r
         path, told = [], []
         for t in time:
             path.append(pose.copy())
-            told.append((speed / (1 - scale), (rate + bias) / (1 - twist)))
-            along = speed * dt + rng.normal(0, np.sqrt(ALONG_M * speed * dt))
-            across = rng.normal(0, np.sqrt(SLIP_M * speed * dt))
+            told.append((speed / (1 - scale - slips[0]), (rate + bias) / (1 - twist - slips[1])))
+            slips = left * slips + rng.normal(0, SLIP_SD * np.sqrt(1 - left**2), 2)
+            along = speed * dt + rng.normal(0, np.sqrt(strays * SLIP_M * speed * dt))
+            across = rng.normal(0, np.sqrt(strays * SLIP_M * speed * dt))
             yaw = pose[2] + rate * dt / 2
             pose = pose + [along * np.cos(yaw) - across * np.sin(yaw), along * np.sin(yaw) + across * np.cos(yaw), 0.0]
-            pose[2] += rate * dt + rng.normal(0, np.sqrt(TURN_RAD * rate * dt))
+            pose[2] += rate * dt + rng.normal(0, np.sqrt((TWIST_RAD * rate + TWIST_M * speed) * dt))
             if pushed is not None and pushed[0] == r and abs(t - pushed[1]) < dt / 2:
                 pose[:2] += pushed[2]
         truth.append(np.array(path))
@@ -54,17 +65,19 @@ def fleet(
         path[:, :2] = path[:, :2] @ turn.T + shift_m
         path[:, 2] += turned_rad
     rows = []
+    errs = np.random.default_rng(seed + 1000).normal(0, staying_m, (robots, robots + len(LANDMARKS)))
     for k in range(0, len(time), 4):
         for to in range(robots):
             sources = [(f"R{r}", truth[r][k, :2], r) for r in range(robots) if r != to]
             if hears is None or to in hears:
                 sources += [(f"L{i}", place, -1) for i, place in enumerate(landmarks)]
-            for name, place, who in sources:
+            for number, (name, place, who) in enumerate(sources):
+                view = who if who >= 0 else robots + (number - robots + 1) % len(LANDMARKS)
                 if any(a <= time[k] < b for q in (to, who) for a, b in [silent.get(q, (0.0, 0.0))]):
                     continue
                 delta = place - truth[to][k, :2]
                 bearing = np.arctan2(delta[1], delta[0]) - truth[to][k, 2]
-                noise = rng.normal(0, 0.05), rng.normal(0, 0.01)
+                noise = rng.normal(0, 0.05) + errs[to, view], rng.normal(0, 0.01)
                 if np.hypot(*delta) < 6.0:
                     rows.append((time[k], name, f"R{to}", np.hypot(*delta) + noise[0], bearing + noise[1]))
     site = Site.model_validate(

@@ -4,7 +4,8 @@ import pytest
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
 from sonofix.team.fleet import follow
-from sonofix.team.message import BYTES, Message, unpack
+from sonofix.team.message import BYTES, TOLD, Message, unpack
+from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth
 from sonofix.team.tell import steps_of
 from team.made_fleet import errors, fleet, nees
@@ -130,12 +131,47 @@ def test_decentralised_is_never_overconfident_nor_surer_than_all_at_once():
     assert np.median(wider) > 1.0
 
 
+def test_deviations_hold_where_errors_of_ranges_stay():
+    ratios, shares = [], []
+    for seed in range(4):
+        recording, truth = fleet(seconds=60, seed=300 + seed, staying_m=0.2, beside=True)
+        feed = gather(recording)
+        view = dict(zip(feed.ends, feed.view.tolist(), strict=True))
+        for emitter, receiver in view:
+            if emitter[0] == "L" and int(emitter[1]) < 4:
+                same = {end for end in view if view[end] == view[emitter, receiver]}
+                assert same <= {(emitter, receiver), (f"L{int(emitter[1]) + 4}", receiver)}
+        assert feed.views < feed.pairs
+        moments, belief = run(recording)
+        ratios.append(nees(*errors(moments, truth, after_s=20)))
+        known = [variance_of(belief.noise.known, 3, kind, 3.0) for kind in (STAYING, NEW)]
+        shares.append(known[0] / sum(known))
+    assert np.mean(ratios) < 2.7
+    # 0.2² of 0.2² + 0.05²
+    assert np.mean(shares) > 0.7
+
+
+def test_a_push_is_blamed_on_nobody_else():
+    recording, _ = fleet(seconds=40, seed=7, pushed=(1, 25.0, 0.8))
+    events = [e for m in run(recording)[0] for e in m.events if e.event in ("slip", "lost")]
+    assert {e.vehicle for e in events} == {"R1"}
+
+
+def test_noise_of_odometry_is_learnt():
+    factors = []
+    for rough in (0.0, 30.0):
+        recording, _ = fleet(seconds=80, seed=8, strays=rough)
+        _, belief = run(recording)
+        factors.append(belief.rough[:, 0])
+    assert np.median(factors[1]) > 10 * np.median(factors[0])
+
+
 def test_messages_come_through_and_are_small():
     rng = np.random.default_rng(0)
-    root = rng.normal(size=(6, 6))
-    sent = Message(3, 12.5, rng.normal(size=6), root @ root.T, 0.5 * root @ root.T, np.array([1.0, 0.2, 0.01, 1e-4]))
+    root = rng.normal(size=(TOLD, TOLD))
+    sent = Message(3, 12.5, rng.normal(size=TOLD), root @ root.T, 0.5 * root @ root.T, np.array([1.0, 0.2, 0.01, 1e-4]))
     packet = sent.pack()
-    assert len(packet) == BYTES < 256
+    assert len(packet) == BYTES < 300
     got = unpack(packet)
     assert (got.sender, got.time_s) == (3, 12.5)
     np.testing.assert_allclose(got.mean, sent.mean, rtol=1e-6)

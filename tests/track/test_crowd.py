@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from locate.made_epochs import BOUNDS, HALL, Drive, make_epoch, make_site
-from sonofix.flow import Street
 from sonofix.records import Floats
+from sonofix.street import Street
 from sonofix.track.belief import Motion
 from sonofix.track.kernel import absorb
 from sonofix.track.many import Crowd, follow_many

@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import chi2
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of
-from sonofix.flow import Street
 from sonofix.locate.fix import fix
 from sonofix.records import Floats, Table
+from sonofix.street import Street
 from sonofix.track import gyro
 from sonofix.track.belief import estimate, predict
 from sonofix.track.follow import Follower

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site
-from sonofix.flow import Street
 from sonofix.records import Floats
+from sonofix.street import Street
 from sonofix.track import stated
 from sonofix.track.update import GATE_SIGMA
 

@@ -10,9 +10,10 @@ from scipy.optimize import approx_fprime
 from scipy.stats import chi2
 
 from sonofix.files import read_recording, read_truth
-from sonofix.flow import Street, run
+from sonofix.flow import run
 from sonofix.geometry import SIZE
 from sonofix.records import Estimate, Floats, Table
+from sonofix.street import Street
 from sonofix.track import steps
 from sonofix.track.belief import Belief, Motion, blank, estimate, predict
 from sonofix.track.follow import Follower

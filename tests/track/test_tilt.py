@@ -10,9 +10,9 @@ from scipy.stats import chi2
 
 from locate.made_epochs import BOUNDS, HALL, make_epoch, make_site, rows_of
 from locate.made_tilts import CORNERS, Flight
-from sonofix.flow import Street
 from sonofix.geometry import TILT_SD_RAD
 from sonofix.records import Estimate, RangeEpoch
+from sonofix.street import Street
 from sonofix.track.belief import Motion, estimate, predict
 from sonofix.track.follow import Follower, expectations
 

@@ -13,9 +13,10 @@ from scipy.stats import chi2
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of
 from sonofix.files import read_recording, read_truth
-from sonofix.flow import Street, run
+from sonofix.flow import run
 from sonofix.geometry import SIZE
 from sonofix.records import Floats, Table
+from sonofix.street import Street
 from sonofix.track import wheels
 from sonofix.track.belief import Motion, estimate, predict
 from sonofix.track.follow import Follower

@@ -199,7 +199,7 @@ def _reach_m(site: Site) -> float:
 
 def _max_difference_mps(site: Site, max_speed_mps: float | None) -> float:
     """Twice the range rates that the receiver searches: a vehicle's speed, doubled where both ends ride."""
-    from sonofix.flow import DEFAULT_MAX_SPEED_MPS
+    from sonofix.receiver import DEFAULT_MAX_SPEED_MPS
 
     speeds = [v.max_speed_mps or DEFAULT_MAX_SPEED_MPS for v in site.vehicles] or [0.0]
     both_ride = any(b.vehicle for b in site.coded_beacons) and any(m.vehicle for m in site.microphones)

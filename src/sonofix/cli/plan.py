@@ -97,7 +97,7 @@ def plan(
     """Map what the beacons promise over the floor, and place more where they help most.
 
     At each place: beacons heard, dilution of precision, expected deviation by the link budget, and the fault of a range
-    that is surely detected. For example, two more beacons for a hall with shelves:
+    that is detected (by the linear model). For example, two more beacons for a hall with shelves:
 
     sonofix plan hall/site.toml --walls shelves.geojson --improve 2
     """

@@ -75,8 +75,8 @@ def task_of(path: Path, walls: Path | None, vehicle: str | None, height_m: float
 
     from sonofix.air import BY_KELVIN_MPS, THERMOMETER_SD_K
     from sonofix.files.floor_plan import read_walls
-    from sonofix.flow import DEFAULT_MAX_SPEED_MPS
     from sonofix.plan.quality import Terms, nodes_of
+    from sonofix.receiver import DEFAULT_MAX_SPEED_MPS
     from sonofix.records import Walls
 
     _check(loudness, height_m)

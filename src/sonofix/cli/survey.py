@@ -175,6 +175,12 @@ def _tell(site: Site, found: Survey, stated: bool) -> None:
         say.print("Note: no beacon is marked as a guess (position_sd_m, --guess-sd): none was moved.")
     if stated and found.beacons and any(b.bias_m is not None for b in found.beacons):
         say.print("Note: ranges.csv is taken as it stands, so these delays are not written to the site file.")
+    if stated and found.pairs and found.sound_speed_prior_sd_mps:
+        scale = 100 * (found.sound_speed_prior_mps / found.sound_speed_mps - 1.0)
+        say.print(
+            f"Note: these biases go with ranges {scale:+.2f} % too long. A site file states that for times of flight "
+            "alone ([air] sound_speed_mps); for ranges in metres leave --sound-speed-sd out."
+        )
     if found.open:
         say.print("\nThis drive does not tell (deviation by the drive alone, and with what was known):")
         for direction in found.open[:24]:

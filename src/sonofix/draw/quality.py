@@ -112,7 +112,7 @@ def _panels(quality: Quality) -> list[_Panel]:
         _Panel("Beacons heard", "in reach and in sight", heard, "count"),
         _Panel("HDOP", f"{dilution}, {level}", quality.hdop, "dilution"),
         _Panel("Expected deviation", "of the position, one fix alone", quality.sd_m, "length"),
-        _Panel("Fault surely detected", "in whichever range it is", fault, "fault"),
+        _Panel("Fault detected", "of any one range, linear model", fault, "fault"),
     ]
     if quality.vdop is not None and quality.sd_z_m is not None:
         panels.insert(2, _Panel("VDOP", "the same, for the height", quality.vdop, "dilution"))
@@ -135,7 +135,7 @@ def _map(figure: Figure, axes: Axes, panel: _Panel, quality: Quality) -> None:
     axes.set_xlabel("east x / m")
     axes.set_ylabel("north y / m")
     if not known.size:
-        words = "no fix anywhere" if panel.kind != "fault" else "no fault is surely detected anywhere"
+        words = "no fix anywhere" if panel.kind != "fault" else "no fault is detected anywhere"
         style.message(axes, words)
         return
     factor, unit = style.length_unit(float(np.median(known))) if panel.kind in ("length", "fault") else (1.0, "")
@@ -267,7 +267,7 @@ def _legend(figure: Figure, quality: Quality, walls: Walls, added: Sequence[str]
     if np.any(line & np.isfinite(walls.height_m)):
         handles.append(Line2D([], [], color=style.INK, linewidth=1.8, linestyle=(0, (3, 1.5)), label="lower wall"))
     if np.any(quality.floor & ~np.isfinite(quality.fault_m)):
-        handles.append(Patch(facecolor=_NO_FIX, label="no fix there, or no fault surely detected"))
+        handles.append(Patch(facecolor=_NO_FIX, label="no fix there, or no fault detected"))
     figure.legend(
         handles=handles, loc="lower left", bbox_to_anchor=(0.043, 0.006), ncols=len(handles), columnspacing=1.8
     )

@@ -18,6 +18,12 @@ STANDING_MPS = 0.01
 ELLIPSES = 14
 """Along each track."""
 
+ALONE_S = 2.0
+"""A robot of which nothing was taken for longer is carried by its odometry alone."""
+
+ROLES = {"explores": (0.62, 1.0), "base": (0.16, 1.0), "alone": (0.62, 0.22)}
+"""Height and opacity of the bars of each role."""
+
 
 def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, Truth] | None = None) -> Figure:
     """Draw a team's tracks, deviations and roles.
@@ -60,7 +66,7 @@ def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, 
         error = figure.add_axes((0.66, 0.50, 0.32, 0.38))
         _draw_doubt(error, tracks, truths, colours)
         roles = figure.add_axes((0.66, 0.08, 0.32, 0.33), sharex=error)
-        _draw_roles(roles, tracks, colours)
+        _draw_roles(roles, recording, steps, tracks, colours)
         roles.set_xlabel("time (s)")
         title = recording.site.name or "team"
         figure.text(0.05, 0.948, title, fontsize=26, fontweight="bold", color=style.INK, va="center")
@@ -131,20 +137,66 @@ def _draw_doubt(
     style.dress(axes, "Deviation of position", "dots: error against the truth" if truths else "")
 
 
-def _draw_roles(axes: Axes, tracks: Mapping[str, Sequence[Estimate]], colours: Mapping[str, str]) -> None:
-    """One lane a robot: thin where it stands, for others to go by; thick where it moves; none where it has no place."""
+def roles_of(
+    recording: Recording, steps: Sequence[Step], name: str, time_s: Floats, moves: Sequence[bool]
+) -> list[str]:
+    """Return what a vehicle did at each of its estimates.
+
+    ``explores``: it moved, and others heard it or it heard; ``base``: it stood, and did; ``alone``: nothing was
+    taken of it for `ALONE_S`, so its odometry alone carried it.
+    """
+    nodes = {node.id for node in (*recording.site.beacons, *recording.site.microphones) if node.vehicle == name}
+    nodes.add(name)
+    told = [
+        step.ranges.sync_s
+        for step in steps
+        if any(e.vehicle == name and e.source in ("fused", "fix") for e in step.estimates)
+        or any(
+            used and (emitter in nodes or receiver in nodes)
+            for used, emitter, receiver in zip(
+                np.asarray(step.range_used, bool).tolist(), step.ranges.emitter, step.ranges.receiver, strict=True
+            )
+        )
+    ]
+    at = np.searchsorted(told, time_s + 1e-9) - 1
+    since = np.where(at >= 0, time_s - np.array([-np.inf, *told])[at + 1], np.inf)
+    return [
+        "alone" if gap > ALONE_S else "explores" if moving else "base" for gap, moving in zip(since, moves, strict=True)
+    ]
+
+
+def _draw_roles(
+    axes: Axes,
+    recording: Recording,
+    steps: Sequence[Step],
+    tracks: Mapping[str, Sequence[Estimate]],
+    colours: Mapping[str, str],
+) -> None:
+    """One lane a robot: what it did over time, and when it slipped."""
     for lane, (name, track) in enumerate(tracks.items()):
         time = np.array([estimate.time_s for estimate in track])
-        moves = np.array([np.hypot(*estimate.velocity_mps[:2]) > STANDING_MPS for estimate in track])
+        moves = [bool(np.hypot(*estimate.velocity_mps[:2]) > STANDING_MPS) for estimate in track]
+        roles = np.array(roles_of(recording, steps, name, time, moves))
         apart = np.concatenate([np.diff(time) > 5.0, [True]])
         changes = np.flatnonzero(
-            np.concatenate([[True], moves[1:] != moves[:-1]]) | np.concatenate([[True], apart[:-1]])
+            np.concatenate([[True], roles[1:] != roles[:-1]]) | np.concatenate([[True], apart[:-1]])
         )
         for a, b in zip(changes, [*changes[1:], len(time)], strict=True):
             end = time[b] if b < len(time) and not apart[b - 1] else time[b - 1]
-            height = 0.62 if moves[a] else 0.16
-            axes.broken_barh([(time[a], max(end - time[a], 1e-3))], (lane - height / 2, height), color=colours[name])
+            height, alpha = ROLES[roles[a]]
+            axes.broken_barh(
+                [(time[a], max(end - time[a], 1e-3))],
+                (lane - height / 2, height),
+                color=colours[name],
+                alpha=alpha,
+                linewidth=0,
+            )
+        slips = [
+            event.time_s for step in steps for event in step.events if event.vehicle == name and event.event == "slip"
+        ]
+        if slips:
+            axes.plot(slips, [lane] * len(slips), "x", color=style.EXCLUDED, markersize=8, markeredgewidth=2, zorder=5)
     axes.set_yticks(range(len(tracks)), list(tracks))
     axes.set_ylim(len(tracks) - 0.4, -0.6)
-    style.dress(axes, "Roles", "thick: explores; thin: stands as a base")
+    style.dress(axes, "Roles", "thick: explores; thin: base; faint: unheard; ×: pushed")
     axes.grid(False, axis="y")

@@ -16,6 +16,9 @@ from sonofix.records import Recording, Step, Truth
 FRAMES = 80
 """At most."""
 
+LEAST_S = 0.5
+"""Frames are no closer than this."""
+
 FRAME_MS = 80
 
 TAIL_S = 0.08
@@ -48,7 +51,7 @@ def write_film(
         figure.set_dpi(72)
         canvas = FigureCanvasAgg(figure)
         frames: list[Image.Image] = []
-        for now in np.linspace(begin, end, FRAMES):
+        for now in np.linspace(begin, end, min(FRAMES, max(2, int((end - begin) / LEAST_S)))):
             axes.clear()
             draw_landmarks(axes, recording)
             for name, track in tracks.items():

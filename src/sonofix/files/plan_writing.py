@@ -14,7 +14,7 @@ from sonofix.files.writing import results_folder, told, write_text
 from sonofix.records import Floats, Quality
 from sonofix.site import Site
 
-PLAN_COLUMNS = "x_m,y_m,z_m,heard,hdop,vdop,sd_m,sd_z_m,fault_m"
+PLAN_COLUMNS = "x_m,y_m,z_m,heard,hdop,vdop,sd_m,sd_z_m,fault_linear_m"
 
 
 def write_plan(out: str | Path, quality: Quality, improved: Site | None = None) -> list[Path]:

@@ -23,7 +23,17 @@ FLAT_M = 0.01
 ONE_HEADING_RAD = 0.1
 """Two solutions whose headings differ by less head alike."""
 
+MOSTLY = 0.9
+"""Share of a direction from which it is called up and down: within 26° of it."""
+
 NO_PLACE = "no position fits; check beacon positions and units"
+
+OPEN_DIRECTION = "the beacons in reach leave a direction open; spread them off one line or plane"
+
+OPEN_HEIGHT = (
+    "beacons and vehicle near one level leave the height open; state the level that the vehicle keeps to (z_m of its "
+    "[[vehicle]]: the height of its origin), or hang a beacon well above or below"
+)
 
 AMBIGUOUS_CHI2 = 28.0
 """Two solutions whose χ² differ by less are both believed: wherever the two lie, noise prefers the wrong one by more
@@ -101,8 +111,8 @@ def judged(
         return replace(_failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=mirror_m)
     covariance = solver.covariance(best)
     if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
-        text = "the beacons in reach leave a direction open; spread them off one line or plane"
-        return _failed(epoch, vehicle, time_s, "no-convergence", text)
+        height = solver.level_m is None and _height_is_open(best)
+        return _failed(epoch, vehicle, time_s, "no-convergence", OPEN_HEIGHT if height else OPEN_DIRECTION)
     if solver.tilts:
         covariance = covariance + solver.bent(kept, best, covariance)
     hpl_m = vpl_m = None
@@ -209,6 +219,13 @@ def _too_weak(best: Solution, covariance: Floats, solver: Rows, rows: NDArray[np
     nearest = float(np.abs(solver.range_m[rows] - best.clock_m).min())
     places = 2 if solver.level_m is not None else 3
     return float(covariance.diagonal()[:places].max()) > (0.5 * max(nearest, 0.2)) ** 2
+
+
+def _height_is_open(found: Solution) -> bool:
+    """Whether what rows tell least of the position, all else being free, is up and down."""
+    place, others = found.jacobian[:, :3], found.jacobian[:, 3:]
+    told = place - others @ np.linalg.lstsq(others, place, rcond=None)[0]
+    return bool(abs(np.linalg.svd(told)[2][-1, 2]) > MOSTLY)
 
 
 def _shift_to_origin(best: Solution, covariance: Floats, arm: Floats) -> tuple[Floats, Floats]:

@@ -29,7 +29,8 @@ STATUSES: tuple[FixStatus, ...] = ("ok", "too-few", "no-convergence", "inconsist
 REMEDIES = (
     "",
     "too few ranges; bring more beacons in reach or state what is known (level_m)",
-    "no position fits, or a direction is left open; check the anchors' places and spread them off one line or plane",
+    "no position fits, or a direction is left open; check the anchors' places, spread them off one line or plane, or"
+    " state level_m where all is near one level",
     "ranges disagree, and which is wrong cannot be told; check the anchors' places, sound speed and echoes",
     "two positions fit alike; state the room's bounds_m or the level_m, or move one anchor",
 )
@@ -109,11 +110,12 @@ def fix_many(
     Raises
     ------
     ValueError
-        If shapes do not match; a place, a level or a range is not finite; a range is below 0 by more than noise makes
-        it where the clock is known; or the covariance of ranges heard is not positive, finite and symmetric.
+        If what is given is no numbers; shapes do not match; a place, a level or a range is not finite; a range is below
+        0 by more than noise makes it where the clock is known; or the covariance of ranges heard is not positive,
+        finite and symmetric.
     """
-    anchors = np.ascontiguousarray(anchors_m, float)
-    ranges = np.ascontiguousarray(ranges_m, float)
+    anchors = _numbers("anchors_m", anchors_m, "one row of x, y, z an anchor")
+    ranges = _numbers("ranges_m", ranges_m, "an epoch a row and an anchor a column, NaN where not heard")
     if anchors.ndim != 2 or anchors.shape[1] != 3:
         raise ValueError(f"anchors_m has shape {anchors.shape}; give one row of x, y, z an anchor: (b, 3)")
     if ranges.ndim != 2 or ranges.shape[1] != len(anchors):
@@ -121,13 +123,18 @@ def fix_many(
     if not np.all(np.isfinite(anchors)):
         i = int(np.argmin(np.isfinite(anchors).all(axis=1)))
         raise ValueError(f"anchors_m[{i}] is {anchors[i].tolist()}; give finite places, or leave the anchor out")
-    if level_m is not None and not np.isfinite(level_m):
-        raise ValueError(f"level_m {level_m}: give a finite level, or None where it is solved for")
-    covariance, each = _covariances(np.asarray(covariance_m2, float), *ranges.shape)
+    level = "a finite level, or None where it is solved for"
+    if level_m is not None:
+        given = _numbers("level_m", level_m, level)
+        if given.ndim or not np.isfinite(given):
+            raise ValueError(f"level_m {level_m}: give {level}")
+        level_m = float(given)
+    covariance, each = _covariances(_numbers("covariance_m2", covariance_m2, "variances or covariances"), *ranges.shape)
     _check_ranges(ranges, np.diagonal(covariance, axis1=1, axis2=2), clock)
-    bounds = np.array([[-np.inf] * 3, [np.inf] * 3] if bounds_m is None else bounds_m, float)
+    corners = "two corners of the room, the lower first: [[x, y, z], [x, y, z]]"
+    bounds = _numbers("bounds_m", [[-np.inf] * 3, [np.inf] * 3] if bounds_m is None else bounds_m, corners)
     if bounds.shape != (2, 3) or not np.all(bounds[0] <= bounds[1]):
-        raise ValueError(f"bounds_m {bounds_m}: give two corners of the room, the lower first: [[x, y, z], [x, y, z]]")
+        raise ValueError(f"bounds_m {bounds_m}: give {corners}")
     flat, clock, n = level_m is not None, bool(clock), len(ranges)
     places = [0, 1] + [2] * (not flat)
     index = np.array(places + [3] * clock)
@@ -155,6 +162,17 @@ def fix_many(
             chi2[e] = left @ np.linalg.solve(own[kept], left)
     states = ("x", "y") + ("z",) * (not flat) + ("clock",) * clock
     return Fixes(states, status, state[:, :3], state[:, 3] if clock else None, spreads, chi2, used)
+
+
+def _numbers(name: str, given: ArrayLike, remedy: str) -> Floats:
+    """Return what was given as decimal numbers; refuse text, complex numbers and rows of different lengths by name."""
+    try:
+        array = np.asarray(given)
+        if array.dtype.kind not in "SUcmM":
+            return np.asarray(array, float, order="C")
+    except (TypeError, ValueError):
+        pass
+    raise ValueError(f"{name} {given!r:.80}: give numbers, {remedy}")
 
 
 def _check_ranges(ranges: Floats, variance: Floats, clock: bool) -> None:

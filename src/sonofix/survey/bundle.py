@@ -20,6 +20,9 @@ STILL = 1e-6
 
 STEPS = 60
 
+LEAST = 1e-3
+"""Share of an assumed deviation that residuals may prove."""
+
 
 def adjust(task: Task, guess: Guess, on_step: Callable[[], None] | None = None) -> Fit:
     """Fit everything: robustly from far off, then without outliers, weights as residuals prove them.
@@ -69,14 +72,15 @@ def _spread(residual: Floats) -> float:
 
 def _unknowns(task: Task) -> int:
     """Unknowns that rows pay for: what the motion prior and prior knowledge bring is not counted as theirs."""
-    drive = task.drive
-    places = np.where(np.isnan(drive.level_m), 3, 2) + drive.turns
-    rates = bool(np.isfinite(drive.rate_mps).any())
-    return int(np.sum(places)) * (2 if rates else 1) + 3 * len(task.movable) + task.biases
+    rates = bool(np.isfinite(task.drive.rate_mps).any())
+    return task.followed + (task.poses if rates else 0)
 
 
 def _factors(task: Task, guess: Guess, used: NDArray[np.bool_]) -> tuple[float, float]:
-    """How much larger residuals are than stated deviations, unknowns accounted for; never below 1."""
+    """How much larger residuals are than stated deviations, unknowns accounted for; below 1 only where none is stated.
+
+    That is, where the deviation of ranges is but an assumption.
+    """
     drive, out = task.drive, []
     residual = residuals(task, guess)
     sds = (drive.range_sd_m, drive.rate_sd_mps)
@@ -84,7 +88,8 @@ def _factors(task: Task, guess: Guess, used: NDArray[np.bool_]) -> tuple[float, 
     paid = np.sqrt(counted / max(counted - _unknowns(task), 0.05 * counted, 1.0))
     for k in range(2):
         there = np.isfinite(residual[k]) & used
-        out.append(max(1.0, paid * _spread((residual[k] / sds[k])[there])) if there.any() else 1.0)
+        least = LEAST if k == 0 and not drive.sd_stated else 1.0
+        out.append(max(least, paid * _spread((residual[k] / sds[k])[there])) if there.any() else 1.0)
     return out[0], out[1]
 
 

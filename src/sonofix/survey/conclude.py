@@ -19,6 +19,12 @@ if TYPE_CHECKING:
 FEW_ROWS = 8
 MOST_EVENTS = 40
 
+TOGETHER_SIGMA = 2.0
+"""Deviations of noise by which residuals must agree to be taken for alike."""
+
+MOST_TAKEN = 0.7
+"""Share of a correlation that unknowns are thought to take, at most."""
+
 TOLD_ALIKE = 1.5
 """Ranges in a row that err alike, from which that is said."""
 
@@ -143,21 +149,25 @@ def _covariance(task: Task, fit: Fit) -> tuple[Floats, float, float]:
     size, axes = np.linalg.eigh(held * unit[:, None] * unit[None, :])
     size = np.maximum(size, 1e-14)
     covariance = unit[:, None] * (axes / size) @ axes.T * unit[None, :]
-    together = alike(drive, z[0], fit.used)
+    together = alike(drive, z[0], fit.used, task.followed)
     return covariance * inflation**2 * together, inflation, together
 
 
-def alike(drive: Drive, z: Floats, used: NDArray[np.bool_]) -> float:
+def alike(drive: Drive, z: Floats, used: NDArray[np.bool_], unknowns: int) -> float:
     """Return how many ranges in a row err alike: by so much fewer they count (Bartlett 1935), 1 where each is alone.
 
-    That is the sum of the autocorrelation of each pair's residuals, all pairs together, up to where it is lost in
+    That is the sum f of the autocorrelation of each pair's residuals, all pairs together, up to where it is lost in
     noise: walls and antennas err for seconds, and what a bias or a scale leaves over stays while the way is alike.
+    Unknowns follow what is slow and leave quick noise: of a correlation, residuals show what unknowns do not take,
+    their share of the ranges.
 
     Parameters
     ----------
     z : float64 (m,)
         Whitened residuals of the ranges used.
     used : bool (n,)
+    unknowns : int
+        That ranges were fitted by.
     """
     rows = np.flatnonzero(used)
     ends = [(drive.emitter[i], drive.receiver[i]) for i in rows]
@@ -165,14 +175,15 @@ def alike(drive: Drive, z: Floats, used: NDArray[np.bool_]) -> float:
     pair = np.array([number[p] for p in ends], np.int64)
     order = np.lexsort((drive.time_s[rows], pair))
     z, pair = z[order], pair[order]
-    total, power = 1.0, float(np.mean(z**2)) if len(z) else 0.0
+    seen: list[float] = []
+    power = float(np.mean(z**2)) if len(z) else 0.0
     for lag in range(1, len(z) // max(2 * len(number), 1)):
         same = pair[lag:] == pair[:-lag]
         together = float(np.mean((z[lag:] * z[:-lag])[same])) / max(power, 1e-30)
-        if together < 3.0 / np.sqrt(np.count_nonzero(same)):
+        if together < TOGETHER_SIGMA / np.sqrt(np.count_nonzero(same)):
             break
-        total += 2.0 * together
-    return total
+        seen.append(together)
+    return 1.0 + 2.0 * sum(seen) / (1.0 - min(unknowns / max(len(z), 1), MOST_TAKEN))
 
 
 def _beacons(
@@ -194,7 +205,7 @@ def _beacons(
             joint[at, at] = np.eye(3) * beacon.position_sd_m**2
         bias = bias_sd = None
         if wishes.biases == "beacon" and mine.any():
-            k = int(task.bias[mine][0])
+            k = int(task.bias[mine][0, 0])
             bias = float(guess.bias_m[k])
             bias_sd = float(np.sqrt(full[3 * len(task.movable) + k, 3 * len(task.movable) + k]))
         out.append(
@@ -221,7 +232,7 @@ def _pairs(task: Task, bias_m: Floats, full: Floats, wishes: Wishes) -> tuple[Pa
     drive, start = task.drive, 3 * len(task.movable)
     single = wishes.biases == "beacon"
     # in one pass from the end, each bias's first row stays
-    first = {int(task.bias[i]): i for i in range(len(drive) - 1, -1, -1) if not single or drive.sends[i]}
+    first = {int(task.bias[i, 0]): i for i in range(len(drive) - 1, -1, -1) if not single or drive.sends[i]}
     sds = np.sqrt(np.diag(full))[start:]
     return tuple(
         PairBias("" if single else drive.emitter[i], drive.receiver[i], float(bias_m[k]), float(sds[k]))

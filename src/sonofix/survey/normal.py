@@ -140,8 +140,9 @@ def _by_shared(task: Task, shown: Shown) -> Floats:
     rows = np.flatnonzero(mine >= 0)
     for axis in range(3):
         out[:, rows, 3 * mine[rows] + axis] = shown.by_place[:, rows, axis]
-    rows = np.flatnonzero(task.bias >= 0)
-    out[0, rows, places + task.bias[rows]] = 1.0
+    for bias in task.bias.T:
+        rows = np.flatnonzero(bias >= 0)
+        out[0, rows, places + bias[rows]] = 1.0
     out[:, :, places + task.biases] = shown.by_excess
     if drive.common_clock:
         out[:, :, places + task.biases + 1 :] = shown.by_clock

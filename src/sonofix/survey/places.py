@@ -105,10 +105,10 @@ def survey(
     epochs, told = thinned(epochs)
     # its error is an unknown here, and no noise that ranges share
     epochs = [with_sound_speed(e, e.sound_speed_mps, 0.0) for e in epochs]
-    drive = gather(site, epochs, wishes.biases == "pair")
+    drive = gather(site, epochs)
     fixed = [b for b in site.beacons if b.vehicle is None]
     movable = np.array([i for i, b in enumerate(fixed) if b.position_sd_m > 0 and i in set(drive.point)], np.int64)
-    nothing = untellable(drive, len(movable), _task(drive, movable, wishes, fixed).biases)
+    nothing = untellable(drive, len(movable), _task(drive, movable, wishes, fixed).asked)
     if nothing:
         return failed(site, drive, nothing)
     rough = not wishes.ignore_guesses and all(fixed[i].position_sd_m <= ROUGH_M for i in movable)
@@ -182,24 +182,35 @@ def _worth(fit: Fit) -> float:
 
 def _task(drive: Drive, movable: NDArray[np.int64], wishes: Wishes, fixed: list[Beacon]) -> Task:
     """Lay out the shared unknowns and what is known of them."""
-    if wishes.biases == "pair":
-        keys = list(zip(drive.emitter, drive.receiver, strict=True))
-    else:
-        keys = [(drive.names[i], "") for i in drive.point]
-    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    none = wishes.biases == "none"
-    bias = np.full(len(drive), -1) if none else np.array([number[key] for key in keys], np.int64)
-    count = 0 if none else len(number)
+    bias, bias_sd = _biases(drive, wishes)
     sd = np.repeat([fixed[i].position_sd_m for i in movable], 3)
     information = np.zeros(len(sd)) if wishes.ignore_guesses else sd**-2.0
     relative = max((wishes.speed_sd_mps or 0.0) / drive.sound_speed_mps, CERTAIN)
     clock = [1e-12, (DRIFT * drive.sound_speed_mps) ** -2.0, WARMING_MPS2**-2.0] if drive.common_clock else []
-    mean = np.concatenate([drive.place_m[movable].ravel(), np.zeros(count + 1 + len(clock))])
-    known = np.concatenate([information, np.full(count, wishes.bias_sd_m**-2.0), [relative**-2.0], clock])
+    mean = np.concatenate([drive.place_m[movable].ravel(), np.zeros(len(bias_sd) + 1 + len(clock))])
+    known = np.concatenate([information, bias_sd**-2.0, [relative**-2.0], clock])
     basis = gauge.freedom_of(drive, movable, drive.place_m).basis
     held = np.zeros((len(mean), basis.shape[1] if wishes.ignore_guesses else 0))
     held[: len(sd)] = basis[:, : held.shape[1]]
     return Task(drive, movable, bias, mean, known, held)
+
+
+def _biases(drive: Drive, wishes: Wishes) -> tuple[NDArray[np.int64], Floats]:
+    """Return which biases each row has (n, 2), and what each bias is expected to be, one deviation (b,).
+
+    First those asked for; then, of pairs whose ranges the site states a doubt of, that one error of each. Where each
+    pair's is asked for the two are one.
+    """
+    pairs = list(zip(drive.emitter, drive.receiver, strict=True))
+    ends = [(drive.names[i], "") for i in drive.point]
+    keys = {"pair": pairs, "beacon": ends, "none": []}[wishes.biases]
+    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    bias = np.full((len(drive), 2), -1)
+    bias[:, 0] = [number[key] for key in keys] or -1
+    doubted = {} if wishes.biases == "pair" else {p: s for p, s in zip(pairs, drive.lasting_sd_m, strict=True) if s}
+    lasting = {pair: len(number) + i for i, pair in enumerate(doubted)}
+    bias[:, 1] = [lasting.get(pair, -1) for pair in pairs]
+    return bias, np.array([wishes.bias_sd_m] * len(number) + list(doubted.values()), float)
 
 
 def _placed(drive: Drive, site: Site, epochs: Sequence[RangeEpoch], wishes: Wishes, place_m: Floats) -> Guess | None:
@@ -219,10 +230,7 @@ def _placed(drive: Drive, site: Site, epochs: Sequence[RangeEpoch], wishes: Wish
     begun = placed_states(drive, site.model_copy(update={"beacons": loose}), epochs)
     if begun is None:
         return None
-    keys = drive.point if wishes.biases == "beacon" else np.zeros(0)
-    pairs = len(set(zip(drive.emitter, drive.receiver, strict=True)))
-    count = {"beacon": len(np.unique(keys)), "pair": pairs, "none": 0}[wishes.biases]
-    return Guess(begun[0], place_m.copy(), np.zeros(count), 0.0, begun[1])
+    return Guess(begun[0], place_m.copy(), np.zeros(len(_biases(drive, wishes)[1])), 0.0, begun[1])
 
 
 def _adjusted(

@@ -38,6 +38,8 @@ class Drive:
     dt : float64 (n,)
         When the row was heard, from its state's instant.
     time_s, range_m, range_sd_m : float64 (n,)
+    lasting_sd_m : float64 (n,)
+        Of the one error that all rows of a pair share, as the site states it; ``range_sd_m`` does not hold it.
     rate_mps, rate_sd_mps : float64 (n,)
         NaN where there are no range rates.
     emitter, receiver : tuple of str, length n
@@ -57,6 +59,8 @@ class Drive:
     sound_speed_mps : float
         That made the ranges.
     common_clock : bool
+    sd_stated : bool
+        False where ``range_sd_m`` is an assumption, as nobody stated how good ranges are.
     skipped : int
         Rows between vehicles, which a survey does not take.
     """
@@ -69,6 +73,7 @@ class Drive:
     time_s: Floats
     range_m: Floats
     range_sd_m: Floats
+    lasting_sd_m: Floats
     rate_mps: Floats
     rate_sd_mps: Floats
     emitter: tuple[str, ...]
@@ -83,6 +88,7 @@ class Drive:
     turns: NDArray[np.bool_]
     sound_speed_mps: float
     common_clock: bool
+    sd_stated: bool
     skipped: int
 
     def __len__(self) -> int:
@@ -104,10 +110,8 @@ class Guess:
     clock: Floats
 
 
-def gather(site: Site, epochs: Sequence[RangeEpoch], by_pair: bool = True) -> Drive:
+def gather(site: Site, epochs: Sequence[RangeEpoch]) -> Drive:
     """Lay the rows of all epochs side by side.
-
-    ``by_pair``: what stays with a pair will be an unknown; else the doubt about it counts as noise of each range.
 
     Raises
     ------
@@ -151,9 +155,8 @@ def gather(site: Site, epochs: Sequence[RangeEpoch], by_pair: bool = True) -> Dr
                 "dt": epoch.time_s[rows] - middle_s,
                 "time_s": epoch.time_s[rows],
                 "range_m": epoch.range_m[rows],
-                "range_sd_m": np.sqrt(
-                    np.diag(epoch.covariance_m2)[rows] - (epoch.bias_m2[rows] if by_pair else 0.0)
-                ),
+                "range_sd_m": np.sqrt(np.diag(epoch.covariance_m2)[rows] - epoch.bias_m2[rows]),
+                "lasting_sd_m": np.sqrt(epoch.bias_m2[rows]),
                 "rate_mps": nothing if epoch.range_rate_mps is None else epoch.range_rate_mps[rows],
                 "rate_sd_mps": nothing if epoch.range_rate_sd_mps is None else epoch.range_rate_sd_mps[rows],
                 "epoch": np.full(len(rows), index),
@@ -186,6 +189,7 @@ def gather(site: Site, epochs: Sequence[RangeEpoch], by_pair: bool = True) -> Dr
         turns=turns[vehicle],
         sound_speed_mps=epochs[0].sound_speed_mps,
         common_clock=epochs[0].clock == "common",
+        sd_stated=all(e.sd_stated for e in epochs),
         skipped=skipped,
         **rest,
     )
@@ -215,8 +219,8 @@ def show(drive: Drive, guess: Guess, bias: NDArray[np.int64]) -> Shown:
 
     Parameters
     ----------
-    bias : int64 (n,)
-        Index of each row's bias; −1: none.
+    bias : int64 (n, k)
+        Indices of each row's biases; −1: none.
     """
     n, moving = len(drive), drive.state >= 0
     own = np.where(moving[:, None], guess.states[drive.state], 0.0) if len(guess.states) else np.zeros((n, STATE))
@@ -253,7 +257,8 @@ def show(drive: Drive, guess: Guess, bias: NDArray[np.int64]) -> Shown:
     since = drive.time_s
     value = np.empty((2, n))
     value[0] = way / scale + guess.clock[0] + guess.clock[1] * since + guess.clock[2] * since**2 / 2
-    value[0] += np.where(bias >= 0, guess.bias_m[bias], 0.0) if len(guess.bias_m) else 0.0
+    if len(guess.bias_m):
+        value[0] += np.where(bias >= 0, guess.bias_m[bias], 0.0).sum(axis=1)
     value[1] = lag * closing / scale + guess.clock[1] + guess.clock[2] * since
     along, side = lag / scale, lag**2 / scale
     by_state, by_place = np.zeros((2, n, STATE)), np.zeros((2, n, 3))

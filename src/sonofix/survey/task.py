@@ -23,8 +23,8 @@ class Task:
     drive : Drive
     movable : int64 (M,)
         Fixed ends that may move, by index in ``drive.names``.
-    bias : int64 (n,)
-        Each row's bias; −1: none.
+    bias : int64 (n, 2)
+        Each row's bias that is asked for, and that which the site states a doubt of; −1: none.
     mean, information : float64 (g,)
         What is known before of the shared unknowns: movable places (3 M), biases, excess of the sound speed, clock (3,
         if common). Excess of information 0: nothing.
@@ -43,6 +43,21 @@ class Task:
     def biases(self) -> int:
         """Number of biases."""
         return int(self.bias.max(initial=-1)) + 1
+
+    @property
+    def asked(self) -> int:
+        """Number of biases that are asked for: the first ones."""
+        return int(self.bias[:, 0].max(initial=-1)) + 1
+
+    @property
+    def poses(self) -> int:
+        """Number of unknowns of all vehicles' poses."""
+        return int(np.sum(np.where(np.isnan(self.drive.level_m), 3, 2) + self.drive.turns))
+
+    @property
+    def followed(self) -> int:
+        """Number of unknowns that ranges must tell: poses, places of movable ends and biases asked for."""
+        return self.poses + 3 * len(self.movable) + self.asked
 
     def shared(self, guess: Guess) -> Floats:
         """Shared unknowns (g,) of a guess."""

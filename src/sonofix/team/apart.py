@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from sonofix.records import Event, Floats
 from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.fleet import ASK_S, LEFT_S, START_SD, Belief, Moment, Watch, instants
+from sonofix.team.hear import TOLD as HEARD
+from sonofix.team.hear import age
 from sonofix.team.message import SENT, Message, unpack
-from sonofix.team.noise import Noise, beyond, noise, scatter
+from sonofix.team.noise import BEARING, NEW, Noise, fade, noise, variance_of
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
-from sonofix.team.state import POSE, SIZE
+from sonofix.team.rough import Rough
+from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP
 
 SHARES = (0.3, 0.5, 0.7, 0.85, 0.95)
 """Weights w of a robot's own estimate that are tried; the one that leaves its place best known is taken."""
@@ -36,8 +39,9 @@ EVERY_S = 1.0
 SURE = (0.3, 0.2)
 """In m and rad: only a robot that knows its place so well may place another."""
 
-UNSURE = (1.5, 0.7)
-"""In m and rad: a robot that knows its place no better is to be placed anew, as corrections are no longer linear."""
+UNSURE = (1.0, 0.35)
+"""In m and rad: a robot that knows its place no better is to be placed anew, as corrections are no longer linear: of
+headings that stray by σ, the way along their mean is exp(−σ²/2) of itself, 6 % less."""
 
 
 class Apart:
@@ -51,22 +55,33 @@ class Apart:
         self.feed = feed
         self.belief = Belief.blank(feed)
         self.dependent = np.zeros_like(self.belief.covariance)
-        self._noise: list[Noise] = [noise(len(feed.robots), feed.pairs, feed.own_ranges) for _ in feed.robots]
+        self._noise: list[Noise] = [noise(len(feed.robots), feed.views, feed.own_ranges) for _ in feed.robots]
+        self.rough = Rough(feed)
+        robots = len(feed.robots)
+        owner = np.full(0 if feed.own_ranges else feed.views, -1)
+        if len(owner):
+            owner[feed.view] = np.where(feed.listener >= 0, feed.listener, feed.source)
+        self._own = [
+            np.concatenate([np.arange(SIZE * r, SIZE * (r + 1)), SIZE * robots + np.flatnonzero(owner == r)])
+            for r in range(robots)
+        ]
         self._last_s: dict[tuple[int, int], float] = {}
         self.told = 0
 
-    def own(self, robot: int) -> slice:
-        """Where a robot's states stand."""
-        return slice(SIZE * robot, SIZE * (robot + 1))
+    def own(self, robot: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Where a robot's states stand in a covariance: its own, and the errors of what it hears of each."""
+        at = self._own[robot]
+        return np.ix_(at, at)  # pyright: ignore[reportReturnType]
 
     def drive(self, from_s: float, until_s: float) -> None:
         """Carry every robot on by its own odometry."""
         self.belief.drive(self.feed, from_s, until_s)
         for robot in np.flatnonzero(self.belief.placed).tolist():
-            carry = np.eye(SIZE)
-            carry[:POSE] = self.belief.by[robot]
+            carry = np.eye(len(self._own[robot]))
+            carry[SPEED_SLIP, SPEED_SLIP] = carry[TURN_SLIP, TURN_SLIP] = np.exp(-(until_s - from_s) / SLIP_S)
+            carry[:POSE, :SIZE] = self.belief.by[robot]
             at = self.own(robot)
-            self.dependent[at, at] = carry @ self.dependent[at, at] @ carry.T
+            self.dependent[at] = carry @ self.dependent[at] @ carry.T
 
     def hear(self, row: int) -> tuple[NDArray[np.bool_], Floats]:
         """Take one row in, at both its ends; return what `Belief.hear` does of it."""
@@ -79,21 +94,40 @@ class Apart:
         meeting = (min(ends), max(ends))
         often = time_s - self._last_s.get(meeting, -np.inf) < EVERY_S
         if often or not all(self.belief.placed[end] for end in ends):
-            return np.zeros((1, 2), bool), np.full((1, 2, 4), np.nan)
+            return np.zeros((1, 2), bool), np.full((1, 2, HEARD), np.nan)
         self._last_s[meeting] = time_s
         return self._exchange(row, ends[0], ends[1], told)
 
     def _alone(self, row: int, robot: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
         """Correct a robot by what nobody else knows of."""
-        at, belief = self.own(robot), replace_noise(self.belief, told)
-        before = belief.covariance[at, at].copy()
-        used, found = belief.hear(self.feed, (row, row + 1))
-        belief.learn(self.feed, (row, row + 1), used, found)
+        at, belief, rows = self.own(robot), replace_noise(self.belief, told), (row, row + 1)
+        time_s = float(self.feed.time_s[row])
+        self.rough.take(self.feed, belief, told, rows, robot, time_s)
+        renewed = self._age(row, told)
+        before = belief.covariance[at].copy()
+        used, found = belief.hear(self.feed, rows)
+        found[:, 0, 5] = renewed
+        belief.learn(self.feed, rows, used, found)
+        self.rough.slipped(belief, robot, time_s)
         if used.any():
             # all corrections together are x' = A x + K z with A P = P'; states that are known have no part in it
-            kept = belief.covariance[at, at] @ np.linalg.pinv(before, hermitian=True)
-            self.dependent[at, at] = kept @ self.dependent[at, at] @ kept.T
+            kept = belief.covariance[at] @ np.linalg.pinv(before, hermitian=True)
+            self.dependent[at] = kept @ self.dependent[at] @ kept.T
         return used, found
+
+    def _age(self, row: int, told: Noise) -> float:
+        """Let a pair's error fade until now, in all that is known of it; return how much of it is new."""
+        feed, belief = self.feed, self.belief
+        if told.believed or feed.kind[row] == COMPASS or not np.isfinite(feed.range_m[row]):
+            return 0.0
+        view, time_s, range_m = int(feed.view[row]), float(feed.time_s[row]), float(feed.range_m[row])
+        left = float(fade(time_s - belief.last[view, 0], range_m, belief.last[view, 1], told.fading))
+        at = SIZE * len(feed.robots) + view
+        age(belief.mean, belief.covariance, at, left)
+        self.dependent[at, :] *= left
+        self.dependent[:, at] *= left
+        belief.last[view] = time_s, range_m
+        return 1.0 - left**2
 
     def _exchange(self, row: int, listener: int, source: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
         """Let two robots that meet tell each other, and correct themselves by it."""
@@ -101,29 +135,33 @@ class Apart:
         measured = np.full(4, np.nan)
         measured[:2] = self.feed.range_m[row], self.feed.bearing_rad[row]
         if np.isfinite(measured[0]):
-            measured[2] = beyond(told.ranges, listener, measured[0])
-        measured[3] = scatter(told.bearings, listener)
+            measured[2] = variance_of(told.known, listener, NEW, measured[0]) * told.swell[listener, 0]
+        measured[3] = variance_of(told.known, listener, BEARING, measured[0]) * told.swell[listener, 1]
+        for end in (listener, source):
+            self.rough.take(self.feed, self.belief, told, (row, row + 1), end, time_s)
+        self._age(row, told)
+        pair = None if told.believed else SIZE * len(self.feed.robots) + int(self.feed.view[row])
         said = {
-            listener: unpack(self._say(listener, time_s, measured)),
-            source: unpack(self._say(source, time_s, np.full(4, np.nan))),
+            listener: unpack(self._say(listener, time_s, measured, pair)),
+            source: unpack(self._say(source, time_s, np.full(4, np.nan), None)),
         }
         self.told += 2
         mean, covariance = self.belief.mean.copy(), self.belief.covariance.copy()
-        result = np.zeros((1, 2), bool), np.full((1, 2, 4), np.nan)
+        result = np.zeros((1, 2), bool), np.full((1, 2, HEARD), np.nan)
         corrected: dict[int, tuple[Floats, Floats]] = {}
         heard = result
         for robot, other in ((listener, source), (source, listener)):
             best: tuple[float, Floats, Floats] | None = None
             for share in SHARES:
-                bound = self._bound(mean, covariance, robot, said[other], share)
+                bound = self._bound(mean, covariance, robot, said[other], share, pair if other == listener else None)
                 heard = bound.hear_with(self.feed, row, told)
                 at = self.own(robot)
-                size = float(np.linalg.det(bound.belief.covariance[at, at][:POSE, :POSE]))
+                size = float(np.linalg.det(bound.belief.covariance[at][:POSE, :POSE]))
                 if heard[0].any() and (best is None or size < best[0]):
-                    best = size, bound.belief.mean[at].copy(), bound.belief.covariance[at, at].copy()
+                    best = size, bound.belief.mean[self._own[robot]], bound.belief.covariance[at]
                     if robot == listener:
                         result = heard
-            now = float(np.linalg.det(covariance[self.own(robot), self.own(robot)][:POSE, :POSE]))
+            now = float(np.linalg.det(covariance[self.own(robot)][:POSE, :POSE]))
             if best is not None and best[0] < GAIN * now:
                 corrected[robot] = best[1], best[2]
             if robot == listener and best is None:
@@ -131,29 +169,37 @@ class Apart:
         for robot in (listener, source):
             at = self.own(robot)
             if robot in corrected:
-                self.belief.mean[at], self.belief.covariance[at, at] = corrected[robot]
-            self.dependent[at, at] = self.belief.covariance[at, at]
+                self.belief.mean[self._own[robot]], self.belief.covariance[at] = corrected[robot]
+            self.dependent[at] = self.belief.covariance[at]
+            self.rough.slipped(self.belief, robot, time_s)
         return result
 
-    def _say(self, robot: int, time_s: float, measured: Floats) -> bytes:
-        """Return a robot's message."""
-        at = np.array(SENT) + SIZE * robot
-        both = np.ix_(at, at)
-        return Message(
-            robot, time_s, self.belief.mean[at], self.belief.covariance[both], self.dependent[both], measured
-        ).pack()
+    def _say(self, robot: int, time_s: float, measured: Floats, pair: int | None) -> bytes:
+        """Return a robot's message; ``pair``: where the error of what it measured stands."""
+        at = np.append(np.array(SENT) + SIZE * robot, 0 if pair is None else pair)
+        mean, both = self.belief.mean[at], np.ix_(at, at)
+        covariance, dependent = self.belief.covariance[both], self.dependent[both]
+        if pair is None:
+            mean[-1] = 0.0
+            for square in (covariance, dependent):
+                square[-1, :] = square[:, -1] = 0.0
+        return Message(robot, time_s, mean, covariance, dependent, measured).pack()
 
-    def _bound(self, mean: Floats, covariance: Floats, robot: int, other: Message, share: float) -> _Bound:
+    def _bound(
+        self, mean: Floats, covariance: Floats, robot: int, other: Message, share: float, pair: int | None
+    ) -> _Bound:
         """Return a belief of a robot and one that it hears of, which holds whatever they share."""
         bound = np.zeros_like(covariance)
         at = self.own(robot)
-        shared = self.dependent[at, at]
-        bound[at, at] = covariance[at, at] + (1.0 / share - 1.0) * shared
+        bound[at] = covariance[at] + (1.0 / share - 1.0) * self.dependent[at]
         of = np.array(SENT) + SIZE * other.sender
-        bound[np.ix_(of, of)] = other.covariance + (1.0 / (1.0 - share) - 1.0) * other.dependent
+        told = slice(len(of) + (pair is not None))
+        of = of if pair is None else np.append(of, pair)
+        widened = other.covariance + (1.0 / (1.0 - share) - 1.0) * other.dependent
+        bound[np.ix_(of, of)] = widened[told, told]
         about = mean.copy()
-        about[of] = other.mean
-        return _Bound(replace(self.belief, mean=about, covariance=bound))
+        about[of] = other.mean[told]
+        return _Bound(replace(self.belief, mean=about, covariance=bound, last=self.belief.last.copy()))
 
 
 class _Bound:
@@ -189,7 +235,7 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
         events: list[Event] = []
         team.drive(time_s if now is None else now, time_s)
         now = time_s
-        used, told = np.zeros((last - first, 2), bool), np.full((last - first, 2, 4), np.nan)
+        used, told = np.zeros((last - first, 2), bool), np.full((last - first, 2, HEARD), np.nan)
         for i in range(first, last):
             used[i - first], told[i - first] = (part[0] for part in team.hear(i))
         watch.see(feed, (first, last), used, told)
@@ -233,6 +279,7 @@ def _lift(team: Apart, recent: Recent, robot: int) -> None:
     at = team.belief.at(robot)
     team.belief.lift(robot)
     team.dependent[at, :] = team.dependent[:, at] = 0.0
+    team.rough.forget(robot)
     recent.forget(robot)
 
 
@@ -247,10 +294,8 @@ def _join(team: Apart, recent: Recent, robot: int, time_s: float, events: list[E
     for who, by in found.by.items():
         covariance += len(found.by) * by @ belief.covariance[belief.at(who), belief.at(who)] @ by.T
     belief.put(robot, Placed(found.pose, covariance, {}))
-    at = team.own(robot)
-    team.dependent[at, at] = belief.covariance[at, at]
-    for who in found.by:
-        team.dependent[team.own(who), team.own(who)] = belief.covariance[team.own(who), team.own(who)]
+    for who in (robot, *found.by):
+        team.dependent[team.own(who)] = belief.covariance[team.own(who)]
     x, y, yaw = found.pose
     text = f"placed at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
     events.append(Event(time_s, team.feed.robots[robot], "joined", text))

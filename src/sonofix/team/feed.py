@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 
 from sonofix.records import Floats, RangeRows, Recording, Table
 from sonofix.site import Site
+from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
 
 SIGHTING, COMPASS = range(2)
+
+BESIDE_M = 0.3
+"""Fixed ends that stand nearer to one another are seen the same way: less than what stands in between is wide."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,8 +29,9 @@ class Feed:
         Height of each robot's origin.
     first : int64 (V + 1,)
         Where each robot's rows of odometry begin.
-    odometry_s, odometry : float64 (k,), (k, 2)
-        Their times; speed (m/s) and yaw rate (rad/s), held until the robot's next row.
+    odometry_s, odometry : float64 (k,), (k, 3)
+        Their times; speed (m/s) and yaw rate (rad/s), held until the robot's next row; and the variance (rad²) of what
+        it may have turned unseen before that: one that drives off from rest, where a compass tells its heading.
     time_s : float64 (n,)
         When each row was heard, in order.
     kind : int64 (n,)
@@ -39,6 +44,8 @@ class Feed:
         NaN where not measured, or not stated.
     pair : int64 (n,)
         Number of its pair of ends.
+    view : int64 (n,)
+        Number of its view: pairs of which one end is the same and the others are fixed within `BESIDE_M` share one.
     ends : tuple of (emitter, receiver), length n
         Ids, as the recording has them.
     own_ranges : bool
@@ -62,6 +69,7 @@ class Feed:
     range_sd_m: Floats
     bearing_rad: Floats
     pair: NDArray[np.int64]
+    view: NDArray[np.int64]
     ends: tuple[tuple[str, str], ...]
     own_ranges: bool
     sound_speed_mps: float
@@ -71,6 +79,11 @@ class Feed:
     def pairs(self) -> int:
         """How many pairs of ends there are."""
         return int(self.pair.max()) + 1 if len(self.pair) else 0
+
+    @property
+    def views(self) -> int:
+        """How many views there are."""
+        return int(self.view.max()) + 1 if len(self.view) else 0
 
     def keep(self, rows: NDArray[np.bool_]) -> Feed:
         """Return the feed with some of its rows alone."""
@@ -87,6 +100,7 @@ class Feed:
                 "range_sd_m",
                 "bearing_rad",
                 "pair",
+                "view",
             )
         }
         return replace(self, **cut, ends=tuple(e for e, kept in zip(self.ends, rows.tolist(), strict=True) if kept))
@@ -111,13 +125,14 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
     site = recording.site
     robots = tuple(vehicle.id for vehicle in site.vehicles)
     level = np.array([vehicle.z_m or 0.0 for vehicle in site.vehicles])
-    first, odometry_s, odometry = _odometry(recording.tables.get("odometry"), robots)
+    compass = recording.tables.get("compass")
+    headed = () if compass is None else compass.names.get("vehicle") or robots[:1]
+    first, odometry_s, odometry = _odometry(recording.tables.get("odometry"), robots, frozenset(headed))
     if not len(odometry_s):
         raise ValueError("odometry.csv: a team is carried by the odometry of its robots, and there is none")
     rows = _sightings(ranges if ranges is not None else recording.ranges, recording.tables.get("bearings"))
     if not rows:
         raise ValueError("ranges.csv, bearings.csv: neither has a row, so no robot can be placed")
-    compass = recording.tables.get("compass")
     if compass is not None:
         whose = compass.names.get("vehicle") or (robots[0],) * len(compass.columns["time_s"])
         told = compass.columns
@@ -150,6 +165,7 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
         range_sd_m=np.array([row[5] for row in rows]),
         bearing_rad=np.array([row[6] for row in rows]),
         pair=np.array([numbers[end] for end in ends], np.int64),
+        view=_views(ends, place),
         ends=ends,
         own_ranges=own_ranges,
         sound_speed_mps=site.sound_speed_mps,
@@ -172,15 +188,21 @@ def heard_by(feed: Feed, landmarks_of: Iterable[str] | None = None, peers: bool 
     return feed.keep(keep)
 
 
-def _odometry(table: Table | None, robots: tuple[str, ...]) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Rows of odometry, robot by robot."""
+def _odometry(
+    table: Table | None, robots: tuple[str, ...], headed: frozenset[str]
+) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """Rows of odometry, robot by robot; ``headed``: those of which a compass tells the heading."""
     if table is None:
-        return np.zeros(len(robots) + 1, np.int64), np.zeros(0), np.zeros((0, 2))
+        return np.zeros(len(robots) + 1, np.int64), np.zeros(0), np.zeros((0, 3))
     time_s = table.columns["time_s"]
     whose = np.array(table.names.get("vehicle") or (robots[0],) * len(time_s))
-    told = np.column_stack([table.columns["v_mps"], table.columns["yaw_rate_radps"]])
+    told = np.column_stack([table.columns["v_mps"], table.columns["yaw_rate_radps"], np.zeros(len(time_s))])
     parts = [np.flatnonzero(whose == robot) for robot in robots]
     parts = [rows[np.argsort(time_s[rows], kind="stable")] for rows in parts]
+    for robot, rows in zip(robots, parts, strict=True):
+        stands = np.abs(told[rows, 0]) < STANDING_MPS
+        if robot in headed:
+            told[rows[1:], 2] = np.where(stands[:-1] & ~stands[1:], UNSEEN_RAD**2, 0.0)
     order = np.concatenate(parts)
     first = np.concatenate([[0], np.cumsum([len(rows) for rows in parts])]).astype(np.int64)
     return first, np.ascontiguousarray(time_s[order]), np.ascontiguousarray(told[order])
@@ -246,6 +268,26 @@ def _ends(
             who = robots.index(node.vehicle)
             out.append((who, np.array(node.lever_arm_m) + [0.0, 0.0, level_m[who]]))
     return out[0][0], out[1][0], out[0][1], out[1][1]
+
+
+def _views(
+    ends: tuple[tuple[str, str], ...], place: dict[tuple[str, str], tuple[int, int, Floats, Floats]]
+) -> NDArray[np.int64]:
+    """Number the views of rows: single linkage of fixed ends that stand beside one another."""
+    first: dict[tuple[str, str], tuple[str, str]] = {}
+    for end, (listener, source, listener_point, source_point) in place.items():
+        first[end] = end
+        for other, (its_listener, its_source, its_listener_point, its_source_point) in place.items():
+            if other == end:
+                break
+            heard = source < 0 and its_source < 0 and listener >= 0 and end[1] == other[1]
+            hears = listener < 0 and its_listener < 0 and source >= 0 and end[0] == other[0]
+            gap = source_point - its_source_point if heard else listener_point - its_listener_point
+            if (heard or hears) and np.linalg.norm(gap) < BESIDE_M:
+                old, new = first[end], first[other]
+                first = {name: new if root == old else root for name, root in first.items()}
+    numbers = {root: i for i, root in enumerate(dict.fromkeys(first[end] for end in ends))}
+    return np.array([numbers[first[end]] for end in ends], np.int64)
 
 
 def _starts(table: Table | None, robots: tuple[str, ...]) -> dict[int, tuple[float, float, float]]:

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats
-from sonofix.team.feed import Feed
-from sonofix.team.hear import hear, learn
+from sonofix.team.feed import SIGHTING, Feed
+from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
-from sonofix.team.state import POSE, SIZE, prior, prior_sd, wander_psd
+from sonofix.team.rough import Rough
+from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
 
 START_SD = (0.05, 0.05, 0.1)
 """Of a stated start pose, in m and rad."""
@@ -108,6 +109,10 @@ class Belief:
     placed : bool (V,)
     noise : Noise
     speed : float64 (V,)
+    rough : float64 (V, 3)
+        Factors on the noise of each robot's odometry.
+    last : float64 (W, 2)
+        When each view's error was last followed, and at which range.
     """
 
     mean: Floats
@@ -115,6 +120,8 @@ class Belief:
     placed: NDArray[np.bool_]
     noise: Noise
     speed: Floats
+    rough: Floats
+    last: Floats
     by: Floats = field(init=False)
     drive_noise: Floats = field(init=False)
 
@@ -127,17 +134,20 @@ class Belief:
     def blank(cls, feed: Feed) -> Belief:
         """Return what is believed before anything was heard: nothing but how large errors may be."""
         robots = len(feed.robots)
-        sd = np.tile(prior_sd(feed.own_ranges), robots)
+        views = 0 if feed.own_ranges else feed.views
+        sd = np.concatenate([np.tile(prior_sd(feed.own_ranges), robots), np.ones(views)])
         covariance = np.diag(sd**2)
         for r in range(robots):
             at = slice(SIZE * r, SIZE * r + POSE)
             covariance[at, at] = 0.0
         return cls(
-            np.tile(prior(), robots),
+            np.concatenate([np.zeros(SIZE * robots), np.zeros(views)]),
             covariance,
             np.zeros(robots, bool),
-            noise(robots, feed.pairs, feed.own_ranges),
+            noise(robots, feed.views, feed.own_ranges),
             np.zeros(robots),
+            np.ones((robots, 4)),
+            np.full((views, 2), np.nan),
         )
 
     def at(self, robot: int) -> slice:
@@ -149,7 +159,7 @@ class Belief:
         psd = wander_psd(feed.own_ranges)
         advance(
             self.mean, self.covariance, self.mean, self.placed, feed.first, feed.odometry_s, feed.odometry,
-            from_s, until_s, psd, self.by, self.drive_noise, self.speed,
+            from_s, until_s, self.rough, psd, self.by, self.drive_noise, self.speed,
         )  # fmt: skip
 
     def hear(self, feed: Feed, rows: tuple[int, int], about: Floats | None = None) -> tuple[NDArray[np.bool_], Floats]:
@@ -159,14 +169,14 @@ class Belief:
         """
         count = rows[1] - rows[0]
         used = np.zeros((count, 2), bool)
-        found = np.full((count, 2, 4), np.nan)
+        found = np.full((count, 2, TOLD), np.nan)
         told = self.noise
         hear(
             self.mean, self.covariance, self.mean if about is None else about, about is None, self.placed, rows,
             feed.time_s, feed.kind, feed.listener, feed.source,
-            feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.pair,
-            told.ranges, told.bearings, told.share, told.last_s, told.believed, 1.0 / feed.sound_speed_mps, self.speed,
-            used, found, np.empty((3, len(self.mean))),
+            feed.listener_point, feed.source_point, feed.range_m, feed.range_sd_m, feed.bearing_rad, feed.view,
+            told.known, told.fading, told.swell, self.last, told.believed, 1.0 / feed.sound_speed_mps, self.speed, used,
+            found, np.empty((3, len(self.mean))),
         )  # fmt: skip
         return used, found
 
@@ -174,8 +184,8 @@ class Belief:
         """Learn how good measurements are from those just taken in."""
         told = self.noise
         learn(
-            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.pair, told.ranges,
-            told.bearings, told.share, told.last_s, told.last, told.believed, used, found,
+            rows, feed.time_s, feed.kind, feed.listener, feed.range_m, feed.range_sd_m, feed.view, told.known,
+            told.runs, told.swell, told.believed, used, found,
         )  # fmt: skip
 
     def put(self, robot: int, found: Placed) -> None:
@@ -219,27 +229,36 @@ class Watch:
         self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
 
     def clear(self, robot: int) -> None:
-        """Forget what was refused."""
+        """Forget what was refused of a robot, by others too: they are not to blame."""
         self._latest[robot].clear()
+        for latest in self._latest:
+            kept = [one for one in latest if one[1] != robot]
+            latest.clear()
+            latest.extend(kept)
 
     def see(self, feed: Feed, rows: tuple[int, int], used: NDArray[np.bool_], told: Floats) -> None:
         """Note what became of some measurements."""
         for k, i in enumerate(range(*rows)):
             asked = np.isfinite(told[k, :, 0])
-            for robot in {int(feed.listener[i]), int(feed.source[i])} - {-1}:
-                if feed.kind[i] == 0 and asked.any():
-                    self._latest[robot].append((i, int(feed.pair[i]), bool(np.all(used[k][asked]))))
+            if feed.kind[i] != SIGHTING or not asked.any():
+                continue
+            ends = int(feed.listener[i]), int(feed.source[i])
+            for robot, other in (ends, ends[::-1]):
+                if robot >= 0:
+                    # fixed ends are told apart by their pair
+                    partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
+                    self._latest[robot].append((i, partner, bool(np.all(used[k][asked]))))
 
     def astray(self) -> tuple[int, list[int]] | None:
         """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
 
-        These are the latest of each pair; None: there is no such robot, or too little to find it by.
+        These are the latest of each partner; None: there is no such robot, or too little to find it by.
         """
         worst: tuple[float, int, list[int]] | None = None
         for robot, latest in enumerate(self._latest):
             if len(latest) < 4:
                 continue
-            refused = {pair: row for row, pair, ok in latest if not ok}
+            refused = {partner: row for row, partner, ok in latest if not ok}
             share = sum(not ok for _, _, ok in latest) / len(latest)
             if len(refused) >= 2 and share >= 0.6 and (worst is None or share > worst[0]):
                 worst = share, robot, sorted(refused.values())
@@ -263,6 +282,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     watch, recent = Watch(len(feed.robots)), Recent(feed)
     for robot, start in feed.starts.items():
         belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
+    rough = Rough(feed)
     past: deque[_Before] = deque()
     now: float | None = None
     asked_s = left_s = -np.inf
@@ -276,16 +296,22 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             _leave(belief, feed, recent, time_s, events)
         frozen = until_placed and belief.placed.all()
         count = last - first
-        used, told = np.zeros((count, 2), bool), np.full((count, 2, 4), np.nan)
+        used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
         if count and not until_placed:
-            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy()))
+            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy(), belief.last.copy()))
             while time_s - past[0].time_s > REWOUND_S:
                 past.popleft()
+            ends = {int(end) for i in range(*rows) for end in (feed.listener[i], feed.source[i])} - {-1}
+            for robot in ends:
+                rough.take(feed, belief, belief.noise, rows, robot, time_s)
             used, told = belief.hear(feed, rows)
+            for robot in ends:
+                rough.slipped(belief, robot, time_s)
             watch.see(feed, rows, used, told)
             found = watch.astray()
             if found is not None:
                 _reopen(belief, feed, found, watch, recent, past, events)
+                rough.forget(found[0])
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
@@ -324,6 +350,7 @@ class _Before:
     rows: tuple[int, int]
     mean: Floats
     covariance: Floats
+    last: Floats
 
 
 def _reopen(
@@ -346,7 +373,7 @@ def _reopen(
     since = [before for before in past if before.rows[1] > rows[0]]
     at, shift, taken = belief.at(robot), np.zeros(POSE), 0.0
     for _ in range(ITERATED):
-        belief.mean[:], belief.covariance[:] = since[0].mean, since[0].covariance
+        belief.mean[:], belief.covariance[:], belief.last[:] = since[0].mean, since[0].covariance, since[0].last
         belief.loosen(robot, SLIPPED)
         track = belief.mean.copy()
         used: list[bool] = []

@@ -7,17 +7,7 @@ import numpy as np
 
 from sonofix.team.feed import COMPASS
 from sonofix.team.kernel import expect, turned_by
-from sonofix.team.noise import (
-    BODY_M,
-    MOST_SHARE,
-    beyond,
-    learn_bearing,
-    learn_range,
-    learn_share,
-    repeated,
-    scatter,
-    staying,
-)
+from sonofix.team.noise import BEARING, CLIPPED, NEW, STAYING, fade, follow_run, take, variance_of
 from sonofix.team.state import SIZE, YAW
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
@@ -32,8 +22,8 @@ TURNS = 4
 STRAIGHT = 0.05**2
 """In rad²: the variance of a direction below which one does."""
 
-ALIKE = 0.1
-"""Ranges that differ by a lesser share of themselves are seen the same way and err together."""
+TOLD = 6
+"""Numbers told of each measurement."""
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -51,22 +41,20 @@ def spread(covariance, row):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def crowd(rows, listener, range_m):
-    """Return how many ranges of about the same length each row's listener heard at once, itself included."""
-    many = np.ones(rows[1] - rows[0])
-    for i in range(rows[0], rows[1]):
-        for j in range(rows[0], i):
-            if listener[i] == listener[j] and abs(range_m[i] - range_m[j]) < ALIKE * range_m[i]:
-                many[i - rows[0]] += 1.0
-                many[j - rows[0]] += 1.0
-    return many
+def age(mean, covariance, at, left):
+    """Let one error of unit variance fade to a part of itself, in place (Gauss-Markov: Gelb 1974, section 3.7)."""
+    mean[at] *= left
+    for j in range(len(mean)):
+        covariance[at, j] *= left
+        covariance[j, at] *= left
+    covariance[at, at] += 1.0 - left * left
 
 
 @numba.njit(cache=True, error_model="numpy")
 def hear(
     mean, covariance, about, follows, placed, rows, time_s, kind, listener, source, listener_point, source_point,
-    range_m, range_sd_m, bearing_rad, pair, ranges, bearings, share, last_s, believed, flight_s_per_m, speed, used,
-    told, work,
+    range_m, range_sd_m, bearing_rad, view, known, fading, swell, last, believed, flight_s_per_m, speed, used, told,
+    work,
 ):  # fmt: skip
     """Take the measurements of some ``rows`` in, in place.
 
@@ -80,13 +68,16 @@ def hear(
         Robots whose place is known; what others heard, or were heard by, is left.
     rows : (first, last)
         Of the `Feed`'s arrays that follow.
-    ranges, bearings, share, last_s, believed
+    known, believed
         `Noise`.
+    last : float64 (P, 2), in and out
+        When each view's error was last followed, and at which range; NaN: never.
     used : bool (rows, 2), out
         Range and bearing taken.
-    told : float64 (rows, 2, 4), out
+    told : float64 (rows, 2, TOLD), out
         Of each: what was measured less what was expected (NaN where nothing was), the variance that the belief gave
-        that, the variance of its noise, and that taken for it.
+        that, the variance of its noise, and that taken for it; of ranges besides the expected square of the error that
+        stays (m²), and how much of that is new.
     work : float64 (3, n)
         Room.
 
@@ -94,7 +85,6 @@ def hear(
     n, robots = len(mean), len(placed)
     row = np.empty((2, n))
     point, before, doubt = about.copy(), np.empty(n), np.empty((n, n))
-    alike = crowd(rows, listener, range_m)
     for i in range(rows[0], rows[1]):
         k = i - rows[0]
         a, b = listener[i], source[i]
@@ -114,13 +104,25 @@ def hear(
             used[k, 1] = True
             continue
         who = a if a >= 0 else robots
-        since = time_s[i] - last_s[pair[i]]
+        own_error = -1
+        stays = 0.0
+        renewed = 0.0
+        if not believed and np.isfinite(range_m[i]):
+            own_error = SIZE * robots + view[i]
+            stays = np.sqrt(variance_of(known, who, STAYING, range_m[i]))
+            left = fade(time_s[i] - last[view[i], 0], range_m[i], last[view[i], 1], fading)
+            renewed = 1.0 - left * left
+            age(mean, covariance, own_error, left)
+            last[view[i], 0], last[view[i], 1] = time_s[i], range_m[i]
         if follows:
             point[:], before[:], doubt[:, :] = mean, mean, covariance
         for turn in range(TURNS):
             if turn > 0:
                 point[:], mean[:], covariance[:, :] = mean, before, doubt
-            shown, direction, way = expect(point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            shown, direction, _ = expect(point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            if own_error >= 0:
+                row[0, own_error] = stays
+                shown += stays * point[own_error]
             wrong = False
             for j in (1, 0):
                 used[k, j] = False
@@ -132,15 +134,12 @@ def hear(
                     if row[j, m] != 0.0:
                         off -= row[j, m] * (mean[m] - point[m])
                 if j == 1:
-                    body = (BODY_M / way) ** 2
-                    variance = scatter(bearings, who) + body
-                    taken = variance - body + body * repeated(MOST_SHARE, since)
+                    variance = variance_of(known, who, BEARING, range_m[i])
                 else:
                     variance = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
-                    taken = variance
                     if not believed:
-                        variance += beyond(ranges, who, range_m[i])
-                        taken = variance * repeated(staying(share), since) * alike[k]
+                        variance += variance_of(known, who, NEW, range_m[i])
+                taken = variance if believed else variance * swell[who, j]
                 own = spread(covariance, row[j])
                 square = off * off / (own + taken)
                 told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3] = off, own, variance, taken
@@ -154,30 +153,33 @@ def hear(
                 used[k, j] = True
             if not follows or spread(doubt, row[1]) < STRAIGHT or not (used[k, 0] or used[k, 1]):
                 break
+        if own_error >= 0:
+            told[k, 0, 4] = stays**2 * (mean[own_error] ** 2 + covariance[own_error, own_error])
+            told[k, 0, 5] = renewed
 
 
 @numba.njit(cache=True, error_model="numpy")
 def learn(
-    rows, time_s, kind, listener, range_m, range_sd_m, pair, ranges, bearings, share, last_s, last, believed, used, told
-):
+    rows, time_s, kind, listener, range_m, range_sd_m, view, known, runs, swell, believed, used, told
+):  # fmt: skip
     """Learn from the measurements just taken in how good such are, in place; arguments as `hear` has them."""
-    robots = len(ranges) - 2
+    robots = len(known) - 2
     for i in range(rows[0], rows[1]):
         k = i - rows[0]
-        if kind[i] == COMPASS or not (used[k, 0] or used[k, 1]):
+        if kind[i] == COMPASS:
             continue
         who = listener[i] if listener[i] >= 0 else robots
-        since = time_s[i] - last_s[pair[i]]
         for j in range(2):
-            if used[k, j]:
-                if j == 0 and np.isfinite(since) and np.isfinite(last[pair[i], j, 0]):
-                    learn_share(share, told[k, j], last[pair[i], j], since)
-                if j == 1:
-                    learn_bearing(bearings, who, told[k, j], told[k, j, 2] - scatter(bearings, who))
-                elif not believed:
-                    stated = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
-                    learn_range(ranges, who, range_m[i], told[k, j], stated)
-                last[pair[i], j] = told[k, j]
+            if not used[k, j] or (j == 0 and believed):
+                continue
+            off, own, variance, taken = told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3]
+            if not believed:
+                swell[who, j] = follow_run(runs[view[i], j], swell[who, j], time_s[i], off / np.sqrt(own + taken))
+            part = variance / (own + variance)
+            square = min((off * part) ** 2, CLIPPED * variance) + own * part
+            if j == 1:
+                take(known, who, BEARING, range_m[i], square, 1.0)
             else:
-                last[pair[i], j, 0] = np.nan
-        last_s[pair[i]] = time_s[i]
+                stated = range_sd_m[i] ** 2 if np.isfinite(range_sd_m[i]) else 0.0
+                take(known, who, NEW, range_m[i], max(square - stated, 0.0), 1.0)
+                take(known, who, STAYING, range_m[i], told[k, 0, 4], told[k, 0, 5])

@@ -9,43 +9,54 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.team.state import BIAS, DRIFT, LAG, OFFSET, SCALE, SIZE, SPEED, TURN, YAW, X, Y
-from sonofix.track.wheels import CREEP_PSD, LONGEST_S, SLIP_M, TWIST_M, TWIST_PSD
+from sonofix.team.state import (
+    BIAS,
+    DRIFT,
+    LAG,
+    OFFSET,
+    SCALE,
+    SIZE,
+    SLIP_S,
+    SLIP_SD,
+    SPEED,
+    SPEED_SLIP,
+    TURN,
+    TURN_SLIP,
+    YAW,
+    X,
+    Y,
+)
+from sonofix.track.wheels import CREEP_PSD, LONGEST_S, SLIP_M, TWIST_M, TWIST_PSD, TWIST_RAD
 
-ALONG_M = 1e-2
-"""In m²/m: how the place strays along the way for each metre driven; wheels slip more along it than across."""
-
-TURN_RAD = 2e-2
-"""In rad²/rad: how the heading strays for each radian turned."""
-
-STRAYS = 3
-"""Ways in which a robot leaves its odometry's track: its place anyway, its place along the way, its heading."""
+STRAYS = 2
+"""Ways in which a robot leaves its odometry's track: its place, its heading."""
 
 UNTOLD_PSD = 0.1
 """In m²/s and rad²/s: how a robot strays whose odometry is silent."""
 
 
 @numba.njit(cache=True, error_model="numpy")
-def drive(own, time_s, told, from_s, until_s, pose, by, stray):
+def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     """Drive a robot on along its odometry, each row of which holds until the next or for `LONGEST_S`.
 
-    With k, l, b the errors of speed, yaw rate and its zero, a row (v, w) moves it on an arc at (1 − k) v and
-    ω = (1 − l) w − b; what is told at t happens at t + lag.
+    With k, l, b the errors of speed, yaw rate and its zero, slips included, a row (v, w) moves it on an arc at
+    (1 − k) v and ω = (1 − l) w − b; what is told at t happens at t + lag.
 
     Parameters
     ----------
     own : float64 (SIZE,)
         The robot's state at ``from_s``.
-    time_s, told : float64 (k,), (k, 2)
-        Rows of its odometry: speed and yaw rate.
+    time_s, told : float64 (k,), (k, 3)
+        Rows of its odometry: speed, yaw rate, and the variance of what it may have turned unseen before.
     from_s, until_s : float
+    rough : float64 (4,)
+        Factors on the variances that `track.wheels` has its place and heading stray by; the rest is not for here.
     pose : float64 (3,), out
         x, y, yaw at ``until_s``.
     by : float64 (3, SIZE), out
         Its derivative by ``own``.
     stray : float64 (STRAYS,), out
-        Variances of what odometry does not tell: of the place (each axis), of the place along the way besides, and of
-        the heading.
+        Variances of what odometry does not tell: of the place (each axis), and of the heading.
 
     Returns
     -------
@@ -53,7 +64,8 @@ def drive(own, time_s, told, from_s, until_s, pose, by, stray):
         Speed at the end.
     """
     x, y, yaw = own[X], own[Y], own[YAW]
-    rest = 1.0 - own[SPEED]
+    rest = 1.0 - own[SPEED] - own[SPEED_SLIP]
+    slip = own[TURN] + own[TURN_SLIP]
     lag = own[LAG]
     begin, end = from_s - lag, until_s - lag
     n = len(time_s)
@@ -61,7 +73,7 @@ def drive(own, time_s, told, from_s, until_s, pose, by, stray):
     first_v = first_w = last_v = last_w = 0.0
     turn_sum = span = 0.0
     x_turn = y_turn = x_drift = y_drift = 0.0
-    place = along = heading = 0.0
+    place = heading = 0.0
     now = begin
     start = True
     while now < end:
@@ -82,7 +94,7 @@ def drive(own, time_s, told, from_s, until_s, pose, by, stray):
                 if silent:
                     v = w = 0.0
         dt = until - now
-        rate = 0.0 if silent else (1.0 - own[TURN]) * w - own[DRIFT]
+        rate = 0.0 if silent else (1.0 - slip) * w - own[DRIFT]
         speed = rest * v
         if start:
             first_v, first_w, start = speed, rate, False
@@ -107,12 +119,12 @@ def drive(own, time_s, told, from_s, until_s, pose, by, stray):
             turn_sum += w * dt
             span += dt
             way = abs(speed * dt)
-            place += CREEP_PSD * dt + SLIP_M * way
-            along += (ALONG_M - SLIP_M) * way
-            heading += TWIST_PSD * dt + TWIST_M * way + TURN_RAD * abs(turned)
+            place += rough[0] * (CREEP_PSD * dt + SLIP_M * way)
+            heading += rough[1] * (TWIST_PSD * dt + TWIST_M * way + TWIST_RAD * abs(turned))
         now = until
         if i + 1 < n and now >= time_s[i + 1]:
             i += 1
+            heading += told[i, 2]
     dx, dy = x - own[X], y - own[Y]
     pose[0], pose[1], pose[2] = x, y, yaw
     by[:, :] = 0.0
@@ -120,14 +132,16 @@ def drive(own, time_s, told, from_s, until_s, pose, by, stray):
     by[0, YAW], by[1, YAW] = -dy, dx
     if rest != 0.0:
         by[0, SPEED], by[1, SPEED] = -dx / rest, -dy / rest
+        by[0, SPEED_SLIP], by[1, SPEED_SLIP] = -dx / rest, -dy / rest
     by[0, TURN], by[1, TURN], by[2, TURN] = x_turn, y_turn, -turn_sum
+    by[0, TURN_SLIP], by[1, TURN_SLIP], by[2, TURN_SLIP] = x_turn, y_turn, -turn_sum
     by[0, DRIFT], by[1, DRIFT], by[2, DRIFT] = x_drift, y_drift, -span
     # later by lag: a piece more at the start, which turns the rest, and one less at the end
     c0, s0 = np.cos(own[YAW]), np.sin(own[YAW])
     by[0, LAG] = first_v * c0 - first_w * dy - last_v * np.cos(yaw)
     by[1, LAG] = first_v * s0 + first_w * dx - last_v * np.sin(yaw)
     by[2, LAG] = first_w - last_w
-    stray[0], stray[1], stray[2] = place, along, heading
+    stray[0], stray[1] = place, heading
     return last_v
 
 
@@ -135,15 +149,10 @@ def drive(own, time_s, told, from_s, until_s, pose, by, stray):
 def strayed(by, stray, noise):
     """Write the covariance (3, 3) of what a drive of derivative ``by`` leaves open, its heading astray all along it."""
     dx, dy = by[1, YAW], -by[0, YAW]
-    place, along, heading = stray[0], stray[1], stray[2]
+    place, heading = stray[0], stray[1]
     noise[0, 0] = place + heading * dy * dy / 3.0
     noise[1, 1] = place + heading * dx * dx / 3.0
     noise[0, 1] = -heading * dx * dy / 3.0
-    flat = dx * dx + dy * dy
-    if flat > 0.0:
-        noise[0, 0] += along * dx * dx / flat
-        noise[1, 1] += along * dy * dy / flat
-        noise[0, 1] += along * dx * dy / flat
     noise[1, 0] = noise[0, 1]
     noise[0, 2] = noise[2, 0] = -heading * dy / 2.0
     noise[1, 2] = noise[2, 1] = heading * dx / 2.0
@@ -152,12 +161,13 @@ def strayed(by, stray, noise):
 
 @numba.njit(cache=True, error_model="numpy")
 def advance(
-    mean, covariance, about, placed, first, time_s, told, from_s, until_s, wander_psd, by, noise, speed,
+    mean, covariance, about, placed, first, time_s, told, from_s, until_s, rough, wander_psd, by, noise, speed,
 ):  # fmt: skip
     """Drive all robots on, in place; of those not ``placed`` the mean alone moves.
 
     The mean moves by what ``about`` does, and by its distance from there. ``first`` (V + 1,) says where each robot's
-    rows of odometry begin; ``by`` (V, 3, SIZE), ``noise`` (V, 3, 3) and ``speed`` (V,) are written.
+    rows of odometry begin; ``rough`` (V, 4) has two factors as `drive` has them, and those on the variances of slips;
+    ``by`` (V, 3, SIZE), ``noise`` (V, 3, 3) and ``speed`` (V,) are written.
     """
     n = len(mean)
     robots = len(placed)
@@ -168,7 +178,7 @@ def advance(
         at = SIZE * r
         own = about[at : at + SIZE].copy()
         a, b = first[r], first[r + 1]
-        speed[r] = drive(own, time_s[a:b], told[a:b], from_s, until_s, pose, by[r], stray)
+        speed[r] = drive(own, time_s[a:b], told[a:b], from_s, until_s, rough[r], pose, by[r], stray)
         strayed(by[r], stray, noise[r])
         moved = np.empty(3)
         for i in range(3):
@@ -205,6 +215,13 @@ def advance(
                 covariance[at + i, k] = covariance[k, at + i]
         for j in range(SIZE):
             covariance[at + j, at + j] += wander_psd[j] * (until_s - from_s)
+        left = np.exp(-(until_s - from_s) / SLIP_S)
+        for j in (SPEED_SLIP, TURN_SLIP):
+            mean[at + j] *= left
+            for k in range(n):
+                covariance[at + j, k] *= left
+                covariance[k, at + j] *= left
+            covariance[at + j, at + j] += (1.0 - left * left) * rough[r, 2 if j == SPEED_SLIP else 3] * SLIP_SD**2
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -10,15 +10,18 @@ from sonofix.records import Floats
 from sonofix.team.state import BIAS, OFFSET, SCALE, YAW, X, Y
 
 SENT = (X, Y, YAW, SCALE, BIAS, OFFSET)
-"""States that are told: the pose, and the errors of what the robot hears."""
+"""States that are told: the pose, and the errors of what the robot hears; besides, that of the range it just measured,
+which stays with its pair."""
 
-_UPPER = np.triu_indices(len(SENT))
+TOLD = len(SENT) + 1
+
+_UPPER = np.triu_indices(TOLD)
 _LAYOUT = np.dtype(
     [
         ("sender", "<u2"),
         ("time_s", "<f8"),
         ("mean", "<f8", 3),
-        ("errors", "<f4", len(SENT) - 3),
+        ("errors", "<f4", TOLD - 3),
         ("covariance", "<f4", len(_UPPER[0])),
         ("dependent", "<f4", len(_UPPER[0])),
         ("measured", "<f4", 4),
@@ -39,9 +42,9 @@ class Message:
     ----------
     sender : int
     time_s : float
-    mean : float64 (6,)
-        Of `SENT`.
-    covariance, dependent : float64 (6, 6)
+    mean : float64 (TOLD,)
+        Of `SENT` and the pair's error; zeros for that where nothing was measured.
+    covariance, dependent : float64 (TOLD, TOLD)
         Of these; and the part of it that others may share, since it was told before or came from them.
     measured : float64 (4,)
         Range and bearing that it measured of whom it answers, and the variances it takes for them; NaN: nothing.
@@ -69,7 +72,7 @@ def unpack(packet: bytes) -> Message:
     row = np.frombuffer(packet, _LAYOUT)[0]
 
     def square(values: Floats) -> Floats:
-        out = np.zeros((len(SENT), len(SENT)))
+        out = np.zeros((TOLD, TOLD))
         out[_UPPER] = values
         return out + np.triu(out, 1).T
 

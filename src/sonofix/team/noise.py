@@ -1,8 +1,9 @@
 """How good ranges and bearings are that nobody vouches for: learnt from themselves, while they are used.
 
-Two things are learnt: how far single measurements scatter, listener by listener and octave of range by octave, and
-which share of a range's error stays from one to the next. What stays tells less than it seems to: many measurements of
-one pair within `KEPT_S` count as few. Of a direction, where the other end's middle is stays (`BODY_M`).
+A range errs by a part that stays while one view of its pair lasts, which is a state of the filter, and by a part that
+is new each time. How large either is, is learnt listener by listener and octave of range by octave; so is how far
+bearings scatter. Each is one step of expectation-maximisation per measurement: what a state and its covariance, once
+corrected, leave of an error's square (Särkkä and Nummenmaa 2009 have the like).
 """
 
 from __future__ import annotations
@@ -13,39 +14,42 @@ import numba
 import numpy as np
 
 from sonofix.records import Floats
-from sonofix.track.stated import BEGIN_SD_M, POOL, SCALE_SD
+from sonofix.track.stated import BEGIN_SD_M, LASTING_S, POOL, SCALE_SD
 
 OCTAVES = 8
 """Of range, the fourth of which begins at 1 m."""
 
-BEGIN_SD_RAD = 0.02
+BEGIN_SD_RAD = 0.03
 """Of bearings, before they have told."""
 
-LEAST_SD_M, LEAST_SD_RAD = 0.01, 2e-3
-"""What nobody vouches for is told no better."""
-
-BODY_M = 0.03
-"""Ends are no points: from one view, the place that a direction tells is so far off, and stays so."""
-
-KEPT_S = 10.0
-"""How long the part of an error lasts that stays: a view, an echo's way, a body in between."""
+LEAST = 1e-4
+"""What nobody vouches for is told no better than by this share of the variance taken before anything was heard."""
 
 BEGIN_SHARE = 0.5
-"""The part that stays, before measurements have told."""
+"""The part of a range's variance that stays, before measurements have told."""
 
-SHARE_POOL = 30.0
-"""Pairs of measurements by which that is outweighed."""
 
-MOST_SHARE = 0.98
+KEPT_SHARE = 0.5
+"""By what share of itself a range changes until its view is another."""
 
 REMEMBERED = 200.0
-"""Measurements of a listener by which their scatter is judged."""
+"""Measurements of a listener by which their scatter is judged; of all listeners ten times as many."""
 
-SHARED = 2000.0
-"""Those of all, by which scatter and the share that stays are."""
+RUN_S = 20.0
+"""How long innovations of one view are summed up."""
+
+SWELLS = 0.1
+"""How fast variances follow, per run."""
+
+SWOLLEN = 100.0
+"""At most."""
 
 CLIPPED = 9.0
-"""A single product counts as at most so many variances."""
+"""A single square counts as at most so many variances."""
+
+STAYING, NEW, BEARING = range(3)
+KINDS = 3
+"""Errors that are learnt: of ranges the part that stays and the one that is new, and of bearings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,128 +58,96 @@ class Noise:
 
     Attributes
     ----------
-    ranges : float64 (V + 2, OCTAVES, 3)
-        Faded count, sum of squares, sum of stated variances; last row: of all.
-    bearings : float64 (V + 2, 2)
-        Count, sum of squares.
-    share : float64 (2,)
-        Of ranges: sum of products of successive misses over their noise, and of what these would be if all stayed.
-    last_s, last : float64 (P,), (P, 2, 4)
-        When each pair was last used, and what `hear.hear` told of it then; NaN: never.
+    known : float64 (V + 2, OCTAVES, KINDS, 2)
+        Faded count, and sum of squares over the variance taken in the beginning; last row: of all listeners.
+    fading : float64 (2,)
+        How long, in s, an error stays, and for what change of range, as a share of that.
+    runs : float64 (W, 2, 3)
+        Of each view, ranges and bearings: when its run of innovations began, their sum, over their deviations, and how
+        many they are.
+    swell : float64 (V + 1, 2)
+        By what factor the variance of what is new of a listener's ranges and bearings is to be taken larger, as
+        innovations do not average out as they should.
     believed : bool
         Ranges are as good as stated, and nothing of them stays.
     """
 
-    ranges: Floats
-    bearings: Floats
-    share: Floats
-    last_s: Floats
-    last: Floats
+    known: Floats
     believed: bool
+    fading: Floats
+    runs: Floats
+    swell: Floats
 
 
-def noise(robots: int, pairs: int, believed: bool) -> Noise:
+def noise(robots: int, views: int, believed: bool) -> Noise:
     """Return what is known before anything was heard."""
     return Noise(
-        np.zeros((robots + 2, OCTAVES, 3)),
-        np.zeros((robots + 2, 2)),
-        np.array([BEGIN_SHARE * SHARE_POOL, SHARE_POOL]),
-        np.full(pairs, np.nan),
-        np.full((pairs, 2, 4), np.nan),
+        np.zeros((robots + 2, OCTAVES, KINDS, 2)),
         believed,
+        np.array([LASTING_S, KEPT_SHARE]),
+        np.full((views, 2, 3), np.nan),
+        np.ones((robots + 1, 2)),
     )
 
 
 @numba.njit(cache=True, error_model="numpy")
 def octave(range_m):
-    """Return the octave of a range."""
+    """Return the octave of a range; of one that was not measured, that of 1 m."""
+    if not np.isfinite(range_m):
+        return 3
     return int(min(max(np.floor(np.log2(max(range_m, 1e-9))) + 3, 0), OCTAVES - 1))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def beyond(ranges, listener, range_m):
-    """Return the variance (m²) that a listener's ranges have beyond what they state."""
+def begun(kind, range_m):
+    """Return the variance (m² or rad²) of an error before anything was heard."""
+    if kind == BEARING:
+        return BEGIN_SD_RAD**2
+    share = BEGIN_SHARE if kind == STAYING else 1.0 - BEGIN_SHARE
+    return share * (BEGIN_SD_M**2 + (SCALE_SD * range_m) ** 2)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def variance_of(known, listener, kind, range_m):
+    """Return the variance (m² or rad²) of an error of a listener, as far as learnt; of ranges beyond what is stated."""
     k = octave(range_m)
-    begin = BEGIN_SD_M**2 + (SCALE_SD * range_m) ** 2
-    every = (ranges[-1, k, 1] - ranges[-1, k, 2] + POOL * begin) / (ranges[-1, k, 0] + POOL)
-    own = (ranges[listener, k, 1] - ranges[listener, k, 2] + POOL * every) / (ranges[listener, k, 0] + POOL)
-    return max(own, LEAST_SD_M**2)
+    every = (known[-1, k, kind, 1] + POOL) / (known[-1, k, kind, 0] + POOL)
+    own = (known[listener, k, kind, 1] + POOL * every) / (known[listener, k, kind, 0] + POOL)
+    return max(own, LEAST) * begun(kind, range_m)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def scatter(bearings, listener):
-    """Return the variance (rad²) of a listener's bearings."""
-    every = (bearings[-1, 1] + POOL * BEGIN_SD_RAD**2) / (bearings[-1, 0] + POOL)
-    own = (bearings[listener, 1] + POOL * every) / (bearings[listener, 0] + POOL)
-    return max(own, LEAST_SD_RAD**2)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def repeated(part, since_s):
-    """Return by what a variance is to be multiplied where the pair was used ``since_s`` ago (NaN: never).
-
-    ``part`` of it stays. Of n samples of a process that fades by ρ from one to the next, the mean has
-    (1 + ρ)/(1 − ρ)/n of the variance.
-    """
+def fade(since_s, range_m, last_m, fading):
+    """Return which part is left of a staying error of ``since_s`` ago at ``last_m``; NaN: there was none."""
     if not np.isfinite(since_s):
-        return 1.0
-    fade = np.exp(-max(since_s, 1e-3) / KEPT_S)
-    return 1.0 - part + part * (1.0 + fade) / (1.0 - fade)
+        return 0.0
+    return np.exp(-max(since_s, 0.0) / fading[0] - abs(range_m - last_m) / (fading[1] * max(range_m, 1e-6)))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def staying(share):
-    """Return the part of a noise that stays, as ``share`` has it."""
-    return min(max(share[0] / share[1], 0.0), MOST_SHARE)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def weigh(told, begin):
-    """Return what a miss says of its noise's variance, and the weight of that in a maximum of the likelihood.
-
-    ``told`` is the miss, the variance that the belief gave it, and that of its noise; ``begin`` the latter before
-    anything was learnt, by which it is weighed: by what it is now, one that came out too small would never grow again.
-    """
-    square = min(told[0] * told[0], CLIPPED * (told[1] + told[2]))
-    return square - told[1], (begin / (told[1] + begin)) ** 2
-
-
-@numba.njit(cache=True, error_model="numpy")
-def learn_range(ranges, listener, range_m, told, stated):
-    """Take in one range, of which variance ``stated`` is stated; ``told`` as `weigh` has it."""
+def take(known, listener, kind, range_m, square, weight):
+    """Take in the square of an error, in m² or rad², of so much weight."""
     k = octave(range_m)
-    square, weight = weigh(told, BEGIN_SD_M**2 + (SCALE_SD * range_m) ** 2)
-    for row in (listener, len(ranges) - 1):
-        keep = 1.0 - weight / (REMEMBERED if row == listener else SHARED)
-        ranges[row, k, 0] = keep * ranges[row, k, 0] + weight
-        ranges[row, k, 1] = keep * ranges[row, k, 1] + weight * square
-        ranges[row, k, 2] = keep * ranges[row, k, 2] + weight * stated
+    ratio = square / begun(kind, range_m)
+    for row in (listener, len(known) - 1):
+        keep = 1.0 - weight / (REMEMBERED if row == listener else 10.0 * REMEMBERED)
+        known[row, k, kind, 0] = keep * known[row, k, kind, 0] + weight
+        known[row, k, kind, 1] = keep * known[row, k, kind, 1] + weight * ratio
 
 
 @numba.njit(cache=True, error_model="numpy")
-def learn_bearing(bearings, listener, told, body):
-    """Take in one bearing, likewise; variance ``body`` is not its listener's."""
-    square, weight = weigh(told, BEGIN_SD_RAD**2)
-    for row in (listener, len(bearings) - 1):
-        keep = 1.0 - weight / (REMEMBERED if row == listener else SHARED)
-        bearings[row, 0] = keep * bearings[row, 0] + weight
-        bearings[row, 1] = keep * bearings[row, 1] + weight * (square - body)
+def follow_run(run, swell, time_s, miss):
+    """Take an innovation, over its deviation, into its view's ``run`` (3,); at its end let ``swell`` follow.
 
-
-@numba.njit(cache=True, error_model="numpy")
-def learn_share(share, told, last, since_s):
-    """Take in two successive misses of a pair.
-
-    ``told`` (4,), ``last`` (4,): miss, variance that the belief gave it, that of its noise, and the one taken for it.
-    That the latter is more leaves a part of the belief's own error in the next miss, which is not counted.
+    Innovations of a filter whose noise is what it is taken for are white: their sums have the variances of as many
+    (Mehra 1970). Where sums are larger, errors stay in ways that no state describes, and many tell as much as few.
     """
-    fade = np.exp(-since_s / KEPT_S)
-    if not fade > 0.1:
-        return
-    left = last[1] * (last[3] - last[2]) / (last[1] + last[3])
-    weight = told[2] * last[2] / ((told[1] + told[2]) * (last[1] + last[2]))
-    most = CLIPPED * told[2]
-    keep = 1.0 - weight / SHARED
-    product = min(max(told[0] * last[0] - left, -most), most) / told[2]
-    share[0] = keep * share[0] + weight * product * fade
-    share[1] = keep * share[1] + weight * fade * fade
+    if np.isfinite(run[0]) and time_s - run[0] > RUN_S:
+        ratio = min(run[1] ** 2 / run[2], CLIPPED)
+        swell = min(max(swell * np.exp(SWELLS * (ratio - 1.0)), 1.0), SWOLLEN)
+        run[0] = np.nan
+    if not np.isfinite(run[0]):
+        run[0], run[1], run[2] = time_s, 0.0, 0.0
+    run[1] += miss
+    run[2] += 1.0
+    return swell

@@ -30,6 +30,9 @@ LIMIT = 3.0
 RIVALS = 9.0
 """How much more another place must cost."""
 
+LEAST = 6
+"""Ranges and bearings that must agree: what is sought told twice over, as one thing heard may have been another."""
+
 AGREEING = 0.7
 """Share of the rows that must be within `LIMIT`."""
 
@@ -86,7 +89,7 @@ class Placed:
 def place(clues: Clues, now: Floats) -> Placed | None:
     """Return where a robot is whose odometry has it at ``now`` (3,) in its own frame; None where clues do not say."""
     told = np.count_nonzero(np.isfinite(clues.range_m)) + np.count_nonzero(np.isfinite(clues.bearing_rad))
-    if told < 4:
+    if told < LEAST:
         return None
     best: list[tuple[float, Floats]] = []
     clues = replace(clues, doubt=_doubt(clues, now))
@@ -97,7 +100,7 @@ def place(clues: Clues, now: Floats) -> Placed | None:
     cost, found = best[0]
     residual, by, by_other = _residuals(clues, found)
     kept = np.abs(residual) < LIMIT
-    if np.count_nonzero(kept) < max(4, AGREEING * len(residual)):
+    if np.count_nonzero(kept) < max(LEAST, AGREEING * len(residual)):
         return None
     information = by[kept].T @ by[kept]
     if not np.linalg.cond(information) < 1e12:

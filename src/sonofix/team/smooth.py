@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from sonofix.records import Floats
 from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.fleet import SLIPPED, Belief, Moment
-from sonofix.team.hear import REFUSED, crowd, spread
-from sonofix.team.kernel import advance, drive, expect, turned_by
-from sonofix.team.noise import BODY_M, MOST_SHARE, Noise, beyond, repeated, scatter, staying
-from sonofix.team.state import POSE, SIZE, YAW, prior, prior_sd, wander_psd
+from sonofix.team.hear import REFUSED, age, spread
+from sonofix.team.kernel import STRAYS, advance, drive, expect, turned_by
+from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
+from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior_sd, wander_psd
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
 
@@ -72,17 +72,17 @@ def smooth(
         )
     active, opened = _spans(feed, moments)
     nominal = _whole(feed, moments, means, active)
-    variance, taken = _variances(feed, belief.noise)
+    errors = _errors(feed, belief.noise)
     judged = None
     blocks, used = np.zeros((len(moments), len(feed.robots), POSE, POSE)), np.zeros((len(feed.time_s), 2), bool)
     for _ in range(passes):
-        smoothed, blocks, used = _pass(feed, moments, nominal, active, opened, taken, judged, on_moment)
+        smoothed, blocks, used = _pass(feed, moments, nominal, active, opened, errors, belief.rough, judged, on_moment)
         nominal = smoothed
-        judged = _judge(feed, moments, nominal, active, variance)
+        judged = _judge(feed, moments, nominal, active, errors)
     speed = np.zeros(len(feed.robots))
     out = []
     for k, moment in enumerate(moments):
-        pose = nominal[k].reshape(-1, SIZE)[:, :POSE]
+        pose = nominal[k, : SIZE * len(feed.robots)].reshape(-1, SIZE)[:, :POSE]
         rows = slice(*moment.rows)
         speed = moment.speed_mps
         out.append(
@@ -126,7 +126,7 @@ def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Fl
 def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray[np.bool_]) -> Floats:
     """Return means that reach back to each robot's first odometry: before it was placed, its odometry run backwards."""
     nominal = means.copy()
-    pose, by, stray = np.empty(POSE), np.empty((POSE, SIZE)), np.empty(3)
+    pose, by, stray, smooth_way = np.empty(POSE), np.empty((POSE, SIZE)), np.empty(STRAYS), np.ones(4)
     times = [moment.time_s for moment in moments]
     for r in range(len(feed.robots)):
         own = slice(SIZE * r, SIZE * (r + 1))
@@ -139,7 +139,7 @@ def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray
             if not active[k, r]:
                 continue
             origin = np.concatenate([np.zeros(POSE), nominal[k + 1, own][POSE:]])
-            drive(origin, feed.odometry_s[a:b], feed.odometry[a:b], times[k], times[k + 1], pose, by, stray)
+            drive(origin, feed.odometry_s[a:b], feed.odometry[a:b], times[k], times[k + 1], smooth_way, pose, by, stray)
             yaw = nominal[k + 1, own][YAW] - pose[2]
             cos, sin = np.cos(yaw), np.sin(yaw)
             back = np.array([cos * pose[0] - sin * pose[1], sin * pose[0] + cos * pose[1]])
@@ -148,33 +148,33 @@ def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray
     return nominal
 
 
-def _variances(feed: Feed, noise: Noise) -> tuple[Floats, Floats]:
-    """Return the variances (rows, 2) of single ranges and bearings, and those to be taken as they come repeatedly."""
-    rows = len(feed.time_s)
-    out, taken = np.full((rows, 2), np.nan), np.full((rows, 2), np.nan)
-    last = np.full(feed.pairs, np.nan)
-    many = np.ones(rows)
-    edges = np.flatnonzero(np.diff(feed.time_s, prepend=-np.inf) > 0)
-    for a, b in zip(edges, [*edges[1:], rows], strict=True):
-        many[a:b] = crowd((int(a), int(b)), feed.listener, feed.range_m)
-    stays = staying(noise.share)
-    for i in range(rows):
+STAYS, LEFT = 2, 3
+
+
+def _errors(feed: Feed, noise: Noise) -> Floats:
+    """Return of each row (rows, 4) how it errs.
+
+    Variances of what is new of its range and bearing; the deviation of its pair's error, and which part of that is left
+    of the one before (1 where there is none).
+    """
+    out = np.full((len(feed.time_s), 4), np.nan)
+    out[:, STAYS], out[:, LEFT] = 0.0, 1.0
+    last = np.full((feed.views, 2), np.nan)
+    for i in range(len(feed.time_s)):
         if feed.kind[i] == COMPASS:
-            out[i, 1] = taken[i, 1] = COMPASS_SD_RAD**2
+            out[i, 1] = COMPASS_SD_RAD**2
             continue
-        pair, who = feed.pair[i], int(feed.listener[i])
-        since = feed.time_s[i] - last[pair]
-        last[pair] = feed.time_s[i]
+        view, who, range_m = feed.view[i], int(feed.listener[i]), float(feed.range_m[i])
         listener = who if who >= 0 else len(feed.robots)
-        stated = feed.range_sd_m[i] ** 2 if np.isfinite(feed.range_sd_m[i]) else 0.0
-        out[i, 0] = taken[i, 0] = stated
-        if not noise.believed:
-            out[i, 0] = stated + beyond(noise.ranges, listener, feed.range_m[i])
-            taken[i, 0] = out[i, 0] * repeated(stays, since) * many[i]
-        white = scatter(noise.bearings, listener)
-        body = (BODY_M / max(feed.range_m[i] if np.isfinite(feed.range_m[i]) else 1.0, BODY_M)) ** 2
-        out[i, 1], taken[i, 1] = white + body, white + body * repeated(MOST_SHARE, since)
-    return out, taken
+        out[i, 0] = feed.range_sd_m[i] ** 2 if np.isfinite(feed.range_sd_m[i]) else 0.0
+        swell = (1.0, 1.0) if noise.believed else noise.swell[listener]
+        out[i, 1] = variance_of(noise.known, listener, BEARING, range_m) * swell[1]
+        if not noise.believed and np.isfinite(range_m):
+            out[i, 0] += variance_of(noise.known, listener, NEW, range_m) * swell[0]
+            out[i, STAYS] = np.sqrt(variance_of(noise.known, listener, STAYING, range_m))
+            out[i, LEFT] = fade(feed.time_s[i] - last[view, 0], range_m, last[view, 1], noise.fading)
+            last[view] = feed.time_s[i], range_m
+    return out
 
 
 def _pass(
@@ -183,7 +183,8 @@ def _pass(
     nominal: Floats,
     active: NDArray[np.bool_],
     opened: Floats,
-    taken: Floats,
+    errors: Floats,
+    rough: Floats,
     judged: Floats | None,
     on_moment: Callable[[], None],
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
@@ -191,10 +192,12 @@ def _pass(
     count, n = nominal.shape
     robots = len(feed.robots)
     mean = nominal[0].copy()
-    sd = np.tile(prior_sd(feed.own_ranges), robots)
+    pairs = n - SIZE * robots
+    sd = np.concatenate([np.tile(prior_sd(feed.own_ranges), robots), np.ones(pairs)])
     covariance = np.diag(sd**2)
+    mean[SIZE * robots :] = 0.0
     for r in range(robots):
-        mean[SIZE * r + POSE : SIZE * (r + 1)] = prior()[POSE:]
+        mean[SIZE * r + POSE : SIZE * (r + 1)] = 0.0
         covariance[SIZE * r : SIZE * r + POSE] = 0.0
     psd = wander_psd(feed.own_ranges)
     bys, drive_noise, speed = np.zeros((count, robots, POSE, SIZE)), np.zeros((robots, POSE, POSE)), np.zeros(robots)
@@ -203,6 +206,8 @@ def _pass(
     totals, misses = np.zeros(2 * len(feed.time_s)), np.zeros(2 * len(feed.time_s))
     ends = np.zeros(count + 1, np.int64)
     used = np.zeros((len(feed.time_s), 2), bool)
+    times = np.array([moment.time_s for moment in moments])
+    rows = np.array([moment.rows for moment in moments])
     weights = np.ones((len(feed.time_s), 2)) if judged is None else judged
     work = np.empty((3, n))
     for k, moment in enumerate(moments):
@@ -210,7 +215,7 @@ def _pass(
             last = moments[k - 1].time_s
             advance(
                 mean, covariance, nominal[k - 1], active[k], feed.first, feed.odometry_s, feed.odometry, last,
-                moment.time_s, psd, bys[k], drive_noise, speed,
+                moment.time_s, rough, psd, bys[k], drive_noise, speed,
             )  # fmt: skip
         for r in np.flatnonzero(active[k]).tolist():
             if opened[k, r].any():
@@ -222,13 +227,16 @@ def _pass(
                 covariance[at, at] += opened[k, r]
         ends[k + 1] = _hear(
             mean, covariance, nominal[k], active[k], moment.rows, feed.kind, feed.listener, feed.source,
-            feed.listener_point, feed.source_point, feed.range_m, feed.bearing_rad, taken, weights, judged is None,
-            1.0 / feed.sound_speed_mps, speed, used, kept, gains, totals, misses, int(ends[k]), work,
+            feed.listener_point, feed.source_point, feed.range_m, feed.bearing_rad, feed.view, errors, weights,
+            judged is None, 1.0 / feed.sound_speed_mps, speed, used, kept, gains, totals, misses, int(ends[k]), work,
         )  # fmt: skip
         means[k], covariances[k] = mean, covariance
         on_moment()
     smoothed, blocks = np.empty((count, n)), np.empty((count, robots, POSE, POSE))
-    _back(means, covariances, bys, active, kept, gains, totals, misses, ends, smoothed, blocks)
+    _back(
+        means, covariances, bys, active, times, rows, feed.view, errors, kept, gains, totals, misses, ends, smoothed,
+        blocks,
+    )  # fmt: skip
     for k in range(count):
         for r in np.flatnonzero(~active[k]).tolist():
             smoothed[k, SIZE * r : SIZE * (r + 1)] = nominal[k, SIZE * r : SIZE * (r + 1)]
@@ -238,11 +246,16 @@ def _pass(
 @numba.njit(cache=True, error_model="numpy")
 def _hear(
     mean, covariance, about, active, rows, kind, listener, source, listener_point, source_point, range_m, bearing_rad,
-    taken, weights, gate, flight_s_per_m, speed, used, kept, gains, totals, misses, end, work,
+    view, errors, weights, gate, flight_s_per_m, speed, used, kept, gains, totals, misses, end, work,
 ):  # fmt: skip
     """Take rows in, linearised about a track, and keep what the way back needs; return where that ends."""
     n = len(mean)
     row = np.empty((2, n))
+    first = SIZE * len(active)
+    # errors of pairs fade all together, before anything is corrected, so that the way back may do so after
+    for i in range(rows[0], rows[1]):
+        if errors[i, LEFT] < 1.0:
+            age(mean, covariance, first + view[i], errors[i, LEFT])
     for i in range(rows[0], rows[1]):
         a, b = listener[i], source[i]
         if (a >= 0 and not active[a]) or (b >= 0 and not active[b]):
@@ -254,6 +267,9 @@ def _hear(
             direction = about[SIZE * a + YAW]
         else:
             shown, direction, _ = expect(about, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            if errors[i, STAYS] > 0.0:
+                row[0, first + view[i]] = errors[i, STAYS]
+                shown += errors[i, STAYS] * about[first + view[i]]
         for j in (1, 0):
             measured = bearing_rad[i] if j == 1 else range_m[i]
             used[i, j] = False
@@ -263,7 +279,7 @@ def _hear(
             for m in range(n):
                 if row[j, m] != 0.0:
                     miss -= row[j, m] * (mean[m] - about[m])
-            variance = taken[i, j] / weights[i, j]
+            variance = errors[i, j] / weights[i, j]
             total = spread(covariance, row[j]) + variance
             if gate and miss * miss > REFUSED * total:
                 continue
@@ -275,7 +291,9 @@ def _hear(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _back(means, covariances, bys, active, kept, gains, totals, misses, ends, smoothed, blocks):
+def _back(
+    means, covariances, bys, active, times, heard, view, errors, kept, gains, totals, misses, ends, smoothed, blocks,
+):  # fmt: skip
     """Smooth backwards: x − P λ and P − P Λ P, with λ and Λ carried back over measurements and drives."""
     count, n = means.shape
     robots = active.shape[1]
@@ -314,11 +332,25 @@ def _back(means, covariances, bys, active, kept, gains, totals, misses, ends, sm
                     )
         if k == 0:
             break
+        for i in range(heard[k, 0], heard[k, 1]):
+            if errors[i, LEFT] < 1.0:
+                at = SIZE * robots + view[i]
+                adjoint[at] *= errors[i, LEFT]
+                for m in range(n):
+                    information[at, m] *= errors[i, LEFT]
+                    information[m, at] *= errors[i, LEFT]
         for r in range(robots):
             if not active[k, r]:
                 continue
             at = SIZE * r
             by = bys[k, r]
+            # slips fade after the drive, so first on the way back
+            left = np.exp(-(times[k] - times[k - 1]) / SLIP_S)
+            for j in (SPEED_SLIP, TURN_SLIP):
+                adjoint[at + j] *= left
+                for m in range(n):
+                    information[at + j, m] *= left
+                    information[m, at + j] *= left
             # Fᵀ λ, Fᵀ Λ F: columns of the pose spread to all of the robot's states
             for i in range(3):
                 told[i] = adjoint[at + i]
@@ -345,9 +377,7 @@ def _back(means, covariances, bys, active, kept, gains, totals, misses, ends, sm
                         information[m, at + j] += by[i, j] * carried[i, m]
 
 
-def _judge(
-    feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArray[np.bool_], variance: Floats
-) -> Floats:
+def _judge(feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArray[np.bool_], errors: Floats) -> Floats:
     """Return weights (rows, 2) by what a track leaves of each measurement; 0: not believed (Huber 1964, cut off)."""
     weights = np.zeros((len(feed.time_s), 2))
     row = np.empty((2, nominal.shape[1]))
@@ -370,8 +400,10 @@ def _judge(
                     speed,
                     row,
                 )
+                if errors[i, STAYS] > 0.0:
+                    shown += errors[i, STAYS] * nominal[k, SIZE * len(feed.robots) + feed.view[i]]
                 left = np.array([feed.range_m[i] - shown, turned_by(feed.bearing_rad[i] - direction)])
-            off = np.abs(left) / np.sqrt(variance[i])
+            off = np.abs(left) / np.sqrt(errors[i, :2])
             weight = np.where(off < np.sqrt(REFUSED), np.minimum(1.0, ROBUST / np.maximum(off, 1e-9)), 0.0)
             if feed.kind[i] == COMPASS:
                 weight = np.minimum(1.0, ROBUST / np.maximum(off, 1e-9))

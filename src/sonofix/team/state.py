@@ -18,19 +18,21 @@ STATES = (
     "range_scale",
     "range_bias",
     "bearing_offset",
+    "speed_slip",
+    "turn_slip",
 )
 """Of one robot, in m and rad: its pose; by what shares of themselves its odometry tells speed and yaw rate too high,
 and the yaw rate that it tells at rest (rad/s); how much later (s) than told its wheels move it; and the errors of what
 it hears: ranges are (1 + range_scale) r + range_bias, bearings bearing_offset too far left."""
 
 SIZE = len(STATES)
-X, Y, YAW, SPEED, TURN, DRIFT, LAG, SCALE, BIAS, OFFSET = range(SIZE)
+X, Y, YAW, SPEED, TURN, DRIFT, LAG, SCALE, BIAS, OFFSET, SPEED_SLIP, TURN_SLIP = range(SIZE)
 
 POSE = 3
 """The first so many are its pose."""
 
-WHEEL_SCALE, WHEEL_SCALE_SD = 0.05, 0.07
-"""Of either scale of odometry: wheels that slip turn further than their robot goes; tyres may differ both ways."""
+WHEEL_SCALE_SD = 0.1
+"""Of either scale of odometry: tyres, loads and a slip that is always there."""
 
 LAG_SD_S = 0.3
 """A controller and its motors take some tenths of a second, unless the wheels themselves are measured."""
@@ -40,6 +42,12 @@ OFFSET_SD_RAD = 0.05
 
 SCALE_PSD = 1e-5
 """In 1/s, how the scales wander: floors, loads and batteries change."""
+
+SLIP_SD = 0.1
+"""Of the share by which a robot slips, more or less than it mostly does."""
+
+SLIP_S = 3.0
+"""How long it does so: a turn, a start, a patch of floor."""
 
 SETTLED_PSD = 1e-10
 """In units² a second: what stays as it is may still change so much, which keeps covariances well conditioned."""
@@ -51,18 +59,11 @@ def prior_sd(own_ranges: bool) -> np.ndarray:
     ``own_ranges``: ranges are the receiver's own, whose errors the site file states, so none are sought.
     """
     scale, bias = (0.0, 0.0) if own_ranges else (SCALE_SD, BIAS_SD_M)
-    errors = (WHEEL_SCALE_SD, WHEEL_SCALE_SD, BIAS_SD_RADPS, LAG_SD_S, scale, bias, OFFSET_SD_RAD)
+    errors = (WHEEL_SCALE_SD, WHEEL_SCALE_SD, BIAS_SD_RADPS, LAG_SD_S, scale, bias, OFFSET_SD_RAD, SLIP_SD, SLIP_SD)
     return np.array([100.0, 100.0, np.pi, *errors])
-
-
-def prior() -> np.ndarray:
-    """Return the means (SIZE,) before anything was heard."""
-    mean = np.zeros(SIZE)
-    mean[SPEED] = mean[TURN] = WHEEL_SCALE
-    return mean
 
 
 def wander_psd(own_ranges: bool) -> np.ndarray:
     """Return how fast each state wanders by itself (SIZE,), in units² a second; the pose does not."""
     heard = 0.0 if own_ranges else SETTLED_PSD
-    return np.array([0.0, 0.0, 0.0, SCALE_PSD, SCALE_PSD, BIAS_PSD, SETTLED_PSD, heard, heard, SETTLED_PSD])
+    return np.array([0.0, 0.0, 0.0, SCALE_PSD, SCALE_PSD, BIAS_PSD, SETTLED_PSD, heard, heard, SETTLED_PSD, 0.0, 0.0])

@@ -1,0 +1,97 @@
+"""From the ranges of an epoch to fixes and estimates: what samples, exchanges and stated ranges all go through."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sonofix.locate.fix import fix
+from sonofix.locate.sound_speed import SoundSpeed
+from sonofix.locate.unstated import fix_by_residuals
+from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step, Table
+from sonofix.site import Site
+from sonofix.track.belief import Belief, Motion, estimate, predict
+from sonofix.track.follow import Follower
+from sonofix.track.inputs import gather
+
+
+class Street:
+    """Follows vehicles by ranges, epoch after epoch."""
+
+    def __init__(self, site: Site, start: Table | None = None, rate_hz: float | None = None) -> None:
+        self.site = site
+        self.rate_hz = rate_hz
+        self.follower = Follower(site, Motion(), site.free_running, gather(site, {}))
+        self.air = SoundSpeed()
+        self._start = start
+        self._written_s: float | None = None
+
+    def sense(self, tables: Mapping[str, Table], stated: tuple[tuple[str, str], ...] | None = None) -> None:
+        """Let what vehicles' own sensors tell of their motion enter, each row at its time; before the first epoch.
+
+        ``stated``: pairs (emitter, receiver) whose ranges come from others, with errors of their own.
+        """
+        inputs = gather(self.site, tables, stated)
+        self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs)
+
+    def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
+        """Take in the ranges of one epoch."""
+        self.begin(epoch.sync_s)
+
+        def solve(asked: RangeEpoch) -> tuple[Fix, ...]:
+            return tuple(fix(asked, self.site, v.id) for v in self.site.vehicles)
+
+        epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
+        before, hidden = self.follower.belief, self.follower.hidden
+        estimates, used, events = self.follower.step(epoch, fixes)
+        believed = used.copy()
+        offset = np.full(len(epoch), 0.0 if epoch.clock == "known" else np.nan)
+        if epoch.clock == "common" and estimates and estimates[0].clock_offset_m is not None:
+            offset[:] = estimates[0].clock_offset_m
+        for found in fixes:
+            if found.status == "ok":
+                asked = np.isfinite(found.residual_m)
+                believed[asked] = found.used[asked]
+                if found.clock_offset_m is not None:
+                    offset[asked] = found.clock_offset_m
+        if self.rate_hz is not None:
+            estimates = self._between(before, hidden, estimates)
+        return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
+
+    def begin(self, time_s: float) -> None:
+        """Put vehicles where start.csv says, once: at the first epoch, or where sensors tell of motion earlier."""
+        if self._start is None:
+            return
+        start, self._start = self._start, None
+        inputs = self.follower.belief.inputs
+        if inputs is not None and len(inputs.time_s):
+            time_s = min(time_s, float(inputs.time_s[0]))
+        if not self.site.vehicles:
+            raise ValueError("start.csv places a vehicle, but the site has none: add a [[vehicle]]")
+        vehicles = start.names.get("vehicle") or (self.site.vehicles[0].id,) * len(start.columns["x_m"])
+        for i, vehicle in enumerate(vehicles):
+            z = start.columns.get("z_m")
+            level = self.site.vehicle(vehicle).z_m
+            height = level if level is not None else (0.0 if z is None or np.isnan(z[i]) else float(z[i]))
+            position = np.array([start.columns["x_m"][i], start.columns["y_m"][i], height])
+            yaw = float(np.nan_to_num(start.columns["yaw_rad"][i])) if "yaw_rad" in start.columns else 0.0
+            self.follower.start(vehicle, time_s, position, yaw)
+
+    def _between(self, before: Belief, hidden: frozenset[int], latest: tuple[Estimate, ...]) -> tuple[Estimate, ...]:
+        """Return estimates on the grid of the wished rate up to the latest instant, by what was known at each."""
+        if self.rate_hz is None:
+            return ()
+        until_s = self.follower.belief.time_s
+        if self._written_s is None:
+            if latest:
+                self._written_s = np.ceil(until_s * self.rate_hz) / self.rate_hz
+            return ()
+        out: list[Estimate] = []
+        while self._written_s <= until_s:
+            if self._written_s >= before.time_s:
+                aged = predict(before, self._written_s, self.follower.motion)
+                told = [i for i in np.flatnonzero(aged.placed).tolist() if i not in hidden]
+                out += [estimate(aged, self.site, i, "predicted") for i in told]
+            self._written_s += 1.0 / self.rate_hz
+        return tuple(out)
