@@ -150,8 +150,15 @@ def _smoothing(bar: Progress, epochs: int) -> Callable[[], None]:
 
     task = bar.add_task("smoothing", total=PASSES * epochs)
 
+    total = PASSES * epochs
+
     def count() -> None:
+        nonlocal total
         bar.advance(task)
+        if bar.tasks[bar.task_ids.index(task)].completed >= total:
+            # where several sizes of errors are likely, each is smoothed by itself
+            total += PASSES * epochs
+            bar.update(task, total=total)
         stop_if_asked()
 
     return count

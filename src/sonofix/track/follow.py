@@ -81,18 +81,22 @@ class Follower:
         few = inputs is not None and inputs.range_slot >= 0 and len(inputs.pairs) <= MOST_PAIRS
         self._panel = Panel() if alone and few else None
 
-    def knowing(self, other: Follower) -> Follower:
+    def knowing(self, other: Follower, sizes: Floats | None = None) -> Follower:
         """Return this follower, at its beginning, with what another has learnt of the same recording by its end.
 
-        That is how agile vehicles are, how far odometry may be trusted and how ranges err: sizes, not values.
+        That is how agile vehicles are, how far odometry may be trusted and how ranges err: sizes, not values. ``sizes``
+        are those of one of `likely` instead.
         """
         trust, inputs = other.belief.trust, self.belief.inputs
         if trust is None or inputs is None:
             return self
+        motion = other.motion
+        if sizes is not None:
+            trust, motion = replace(trust, sizes=sizes), replace(motion, acceleration_psd=float(sizes[3]))
         covariance = self.belief.covariance.copy()
         stated.open_pairs(covariance, inputs.range_slot, trust)
         self.belief = replace(self.belief, covariance=covariance, trust=trust, rough=other.belief.rough)
-        self.motion, self._banks, self._panel = other.motion, {}, None
+        self.motion, self._banks, self._panel = motion, {}, None
         return self
 
     def start(self, vehicle: str, time_s: float, position_m: Floats, yaw_rad: float) -> None:
@@ -313,6 +317,12 @@ class Follower:
                     if young and self._rival is not None and self._rival.vehicle == who:
                         self._undecided[who] = True
         return used
+
+    @property
+    def likely(self) -> list[tuple[float, Floats]]:
+        """Weight and sizes of the members that may be right; empty where they were not needed."""
+        needed = self._panel is not None and self.belief.trust is not None and self.belief.trust.sizes is not None
+        return self._panel.likely() if self._panel is not None and needed else []
 
     @property
     def weighs(self) -> bool:

@@ -74,6 +74,9 @@ ROUGH_M = 0.3
 """Where ranges err by more, several times what is expected of them, the track is what the members hold; else each
 pair's errors are best learnt by themselves (`stated.Trust`)."""
 
+NEARLY_ALL = 0.95
+"""Of the weight; members that hold the rest change nothing worth their time."""
+
 MEMBERS = np.array(list(product((stated.BEGIN_SD_M,), QUICK_M, QUICK_S, FREE_PSD)))
 """Of each (K, 4): slow and quick deviation, quick time, density of acceleration."""
 
@@ -201,6 +204,13 @@ class Panel:
     def sizes(self) -> Floats:
         """Slow and quick deviation (m), quick time (s), density of acceleration (m²/s³): weighted, as logarithms."""
         return np.exp(self.weight @ np.log(MEMBERS))
+
+    def likely(self) -> list[tuple[float, Floats]]:
+        """Weight and sizes of the likeliest members, which hold `NEARLY_ALL` of the weight."""
+        weight = self.weight
+        order = np.argsort(-weight)
+        count = int(np.searchsorted(np.cumsum(weight[order]), NEARLY_ALL)) + 1
+        return [(float(weight[k]), MEMBERS[k]) for k in order[:count]]
 
     def silent(self, time_s: float) -> bool:
         """Whether nothing was heard for long."""

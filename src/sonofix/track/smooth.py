@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from sonofix.geometry import link
-from sonofix.records import Estimate
+from sonofix.records import Estimate, Floats
 from sonofix.track.belief import SIZE, Belief, estimate, predict
 from sonofix.track.chain import Chain
 from sonofix.track.follow import Follower
@@ -59,8 +60,11 @@ def smooth(
     list of tuple of Estimate, as long as ``heard``
         Of source "smoothed", in order of time: what falls to each epoch.
     """
-    passage = settle(begin, heard, rate_hz, passes, on_epoch)
-    return track(passage, heard, passage.back(), rate_hz)
+    parts = []
+    for weight, each in _beginnings(begin, heard, on_epoch):
+        passage = settle(each, heard, rate_hz, passes, on_epoch)
+        parts.append((weight, track(passage, heard, passage.back(), rate_hz)))
+    return parts[0][1] if len(parts) == 1 else _mixed(parts)
 
 
 def track(
@@ -113,7 +117,7 @@ def settle(
         # scale is then told more surely than it is (as in `update`)
         passes = 1
     guide: Guide | None = None
-    before = _scouted(begin, heard)
+    before: Follower | None = None
     for left in reversed(range(passes)):
         follower = begin() if before is None else begin().knowing(before)
         passage = Passage(follower, rate_hz, guide, rows or left > 0)
@@ -133,17 +137,52 @@ def settle(
     raise ValueError(f"passes: {passes}; at least 1 is needed")
 
 
-def _scouted(begin: Callable[[], Follower], heard: Sequence[Heard]) -> Follower | None:
-    """Return a follower that has learnt on a first way through how ranges err and how freely the vehicle moves.
+def _beginnings(
+    begin: Callable[[], Follower], heard: Sequence[Heard], on_epoch: Callable[[], None]
+) -> list[tuple[float, Callable[[], Follower]]]:
+    """Return what the recording is smoothed from, and how likely each is: one beginning, if that is all there is to it.
 
-    None where that is not learnt by members (`panel.Panel`), which no chain of knots can tie, or they were not needed.
+    Where members of different sizes of errors were needed (`panel.Panel`), which no chain of knots can tie, a first way
+    through weighs them, and each that is likely is smoothed by itself.
     """
     scout = begin()
     if not scout.weighs:
-        return None
+        return [(1.0, begin)]
     for epoch, fixes in heard:
         scout.step(epoch, fixes)
-    return scout if scout.belief.trust is not None and scout.belief.trust.sizes is not None else None
+        on_epoch()
+    return [(w, partial(_with, begin, scout, sizes)) for w, sizes in scout.likely] or [(1.0, begin)]
+
+
+def _with(begin: Callable[[], Follower], scout: Follower, sizes: Floats) -> Follower:
+    return begin().knowing(scout, sizes)
+
+
+def _mixed(parts: Sequence[tuple[float, list[tuple[Estimate, ...]]]]) -> list[tuple[Estimate, ...]]:
+    """Return the mean of tracks, by weight, with their scatter in its covariance."""
+    weight = np.array([w for w, _ in parts])
+    out = []
+    for epoch in zip(*(told for _, told in parts), strict=True):
+        # what one began from later than others, only they have
+        times = sorted({e.time_s for some in epoch for e in some})
+        by_time = [{e.time_s: e for e in some} for some in epoch]
+        rows = [[(w, told[at]) for w, told in zip(weight, by_time, strict=True) if at in told] for at in times]
+        out.append(tuple(_mean(row) for row in rows))
+    return out
+
+
+def _mean(row: list[tuple[float, Estimate]]) -> Estimate:
+    """Mean of estimates of one vehicle at one instant that have the same states."""
+    share = np.array([w for w, _ in row]) / sum(w for w, _ in row)
+    states = row[0][1].states
+    each = np.array([np.concatenate([e.position_m, e.velocity_mps]) for _, e in row])
+    mean = share @ each
+    at = [("x", "y", "z", "vx", "vy", "vz").index(s) for s in states if s in ("x", "y", "z", "vx", "vy", "vz")]
+    own = [i for i, s in enumerate(states) if s in ("x", "y", "z", "vx", "vy", "vz")]
+    covariance = np.einsum("k,kij->ij", share, np.array([e.covariance for _, e in row]))
+    apart = (each - mean)[:, at]
+    covariance[np.ix_(own, own)] += (share[:, None] * apart).T @ apart
+    return replace(row[0][1], position_m=mean[:3], velocity_mps=mean[3:], covariance=covariance)
 
 
 class FixedLag:
