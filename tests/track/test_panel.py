@@ -122,7 +122,7 @@ def test_a_pair_that_is_blocked_is_opened_at_last() -> None:
 
 
 def test_smoothing_holds_what_its_members_hold() -> None:
-    """Of errors of 0.8 m that last 30 s a smoothed track is better than the causal one, and not far surer than right."""
+    """Of errors of 0.8 m that last 30 s a smoothed track is better than the causal one, not far surer than right."""
     rng = np.random.default_rng(5)
     error, fade = rng.normal(0, 0.8, len(ENDS_M)), np.exp(-PERIOD_S / 30.0)
 
