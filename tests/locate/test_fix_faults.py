@@ -54,6 +54,38 @@ def test_one_range_off_by_far_is_left_out_of_precise_ones(
         assert error_m @ np.linalg.solve(covariance, error_m) < 36
 
 
+@pytest.mark.parametrize("level_m", [None, 1.1], ids=["space", "level"])
+@pytest.mark.parametrize("clock_m", [None, 60.0])
+@pytest.mark.parametrize("by_m", [3.0, 8.0, 30.0])
+def test_circles_that_do_not_meet_are_no_place_though_none_is_to_spare(
+    level_m: float | None, clock_m: float | None, by_m: float, rng: np.random.Generator
+) -> None:
+    needed = 3 + (level_m is None) + (clock_m is not None) - 1
+    site = make_site(HALL[:needed], level_m=level_m, bounds_m=BOUNDS)
+    for _ in range(20):
+        place = (*rng.uniform((1, 1), (9, 7)), 1.1)
+        epoch = make_epoch(site, Drive(place), sd_m=0.002, clock_m=clock_m, rng=rng)
+        found = fix(shifted(epoch, int(rng.integers(needed)), by_m), site, "v")
+        if found.status == "ok":  # they meet somewhere else: nothing can tell
+            np.testing.assert_allclose(found.residual_m, 0.0, atol=0.02)
+
+
+def test_a_wrong_choice_that_agrees_by_chance_is_gainsaid() -> None:
+    # a wrong range drew the fix into the valley of another height, where leaving out another range agrees as well
+    anchors = np.array(
+        [(0.0, 0.0, 2.4), (9.0, 1.0, 2.5), (8.0, 7.0, 2.2), (1.0, 8.0, 2.6), (4.0, 3.0, 2.3), (6.0, 5.0, 0.3)]
+    )
+    rng = np.random.default_rng(1)
+    site = make_site(anchors)
+    for _ in range(100):
+        place = (*rng.uniform((1, 1), (8, 7)), rng.uniform(0.5, 1.5))
+        epoch = make_epoch(site, Drive(place), sd_m=0.005, rng=rng)
+        found = fix(shifted(epoch, int(rng.integers(6)), float(rng.uniform(0.2, 3.0))), site, "v")
+        if found.status == "ok":
+            error_m = found.position_m - place
+            assert error_m @ np.linalg.solve(found.covariance, error_m) < 36
+
+
 @pytest.mark.parametrize("by_m", [30.0, 300.0])
 def test_far_ranges_that_cannot_be_told_apart_have_no_confident_place(by_m: float, rng: np.random.Generator) -> None:
     site = make_site(HALL, bounds_m=BOUNDS)

@@ -15,7 +15,7 @@ MOST_PAIRS = 66
 """Pairs of rows tried as both faulty: all of twelve rows."""
 
 MOST_ANEW = 12
-"""Choices that are solved from new starts where no descent from the faulty fix mends it."""
+"""Choices that are solved from new starts: those that agree best by a descent from the faulty fix."""
 
 APART_SIGMA = 6.0
 """Two selections that both pass the test but put the vehicle this far apart leave the fault undecided: so many
@@ -47,13 +47,12 @@ def exclude(
             break
         choices = _leaving(rows, count)
         place_m, chi2 = solver.without(choices, found[0])
-        order = np.argsort(chi2, kind="stable")
-        if not agrees(solver, len(rows) - count, float(chi2[order[0]])):
-            # a descent from where the faulty row drew the fix may end in a wrong valley: begin anew without it
-            for i in order[:MOST_ANEW]:
-                anew = solver.candidates(choices[i])
-                if anew and anew[0].chi2 < chi2[i]:
-                    chi2[i], place_m[i] = anew[0].chi2, anew[0].position_m
+        for i in np.argsort(chi2, kind="stable")[:MOST_ANEW]:
+            # a descent from where the faulty row drew the fix may end in a wrong valley: begin anew without it, for
+            # the true choice to gainsay another that agrees by chance
+            anew = solver.candidates(choices[i])
+            if anew and anew[0].chi2 < chi2[i]:
+                chi2[i], place_m[i] = anew[0].chi2, anew[0].position_m
         tried.append((choices, place_m, chi2))
         mended = _mended(solver, choices, place_m, chi2, MENDED)
         if mended is not None:
@@ -66,8 +65,11 @@ def exclude(
 
 
 def agrees(solver: Rows, count: int, chi2: float) -> bool:
-    """Whether the misfit of so many rows is what their deviations allow (true where none is left over to tell)."""
-    return chi2 <= threshold(solver.degrees(count))
+    """Whether the misfit of so many rows is what their deviations allow.
+
+    Where none is left over to tell, noise may still put circles apart that ought to meet, along one axis.
+    """
+    return chi2 <= threshold(max(1, solver.degrees(count)))
 
 
 def _mended(

@@ -96,7 +96,7 @@ def judged(
     remedy = ""
     inflation = 1.0
     if not agrees(solver, len(kept), best.chi2):
-        status, inflation = "inconsistent", best.chi2 / solver.degrees(len(kept))
+        status, inflation = "inconsistent", best.chi2 / max(1, solver.degrees(len(kept)))
         if solver.descends(kept, best) > AT_REST * inflation:
             return _failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
         remedy = "ranges disagree and no single one explains it; check beacon positions, sound speed and echoes"

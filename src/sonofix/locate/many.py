@@ -138,7 +138,7 @@ def fix_many(
     flat, clock, n = level_m is not None, bool(clock), len(ranges)
     places = [0, 1] + [2] * (not flat)
     index = np.array(places + [3] * clock)
-    degrees = np.arange(len(anchors) + 1) - len(index)
+    degrees = np.maximum(np.arange(len(anchors) + 1) - len(index), 1)
     limits = np.array([[threshold(int(d), rate) for d in degrees] for rate in (FALSE_ALARM, MENDED)])
     status, state, chi2 = np.zeros(n, np.int8), np.full((n, 4), np.nan), np.full(n, np.nan)
     spreads, used = np.full((n, len(index), len(index)), np.nan), np.zeros((n, len(anchors)), bool)

@@ -91,7 +91,7 @@ def solve_all(anchors, ranges, covariance, each, known, judge, status, state, sp
         kept, found, isolated = leave_out(problem, limits, states, chi2s, found)
         inflation = 1.0
         if chi2s[0] > limits[0, len(kept)]:
-            inflation = chi2s[0] / (len(kept) - count)
+            inflation = chi2s[0] / max(1, len(kept) - count)
             if descends(chosen(problem, kept), known, states[0], chi2s[0]) > AT_REST * inflation:
                 continue
         elif not isolated:

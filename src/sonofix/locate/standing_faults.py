@@ -126,12 +126,11 @@ def leave_out(problem, limits, states, chi2s, found):
         left = choices.shape[1]
         if turn < 2:
             without(problem, choices, begin_at, places, misfits)
-            order = np.argsort(misfits, kind="mergesort")
-            if not misfits[order[0]] <= limits[0, left]:
-                # a descent from where the faulty row drew the fix may end in a wrong valley: begin anew without it
-                for i in order[:MOST_ANEW]:
-                    if anew(problem, choices[i], states, chi2s) and chi2s[0] < misfits[i]:
-                        misfits[i], places[i] = chi2s[0], states[0]
+            for i in np.argsort(misfits, kind="mergesort")[:MOST_ANEW]:
+                # a descent from where the faulty row drew the fix may end in a wrong valley: begin anew without it, for
+                # the true choice to gainsay another that agrees by chance
+                if anew(problem, choices[i], states, chi2s) and chi2s[0] < misfits[i]:
+                    misfits[i], places[i] = chi2s[0], states[0]
         best = np.argmin(misfits)
         if not misfits[best] <= limits[1 if turn < 2 else 0, left]:
             continue
