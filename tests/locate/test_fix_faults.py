@@ -71,19 +71,15 @@ def test_circles_that_do_not_meet_are_no_place_though_none_is_to_spare(
 
 
 def test_a_wrong_choice_that_agrees_by_chance_is_gainsaid() -> None:
-    # a wrong range drew the fix into the valley of another height, where leaving out another range agrees as well
-    anchors = np.array(
-        [(0.0, 0.0, 2.4), (9.0, 1.0, 2.5), (8.0, 7.0, 2.2), (1.0, 8.0, 2.6), (4.0, 3.0, 2.3), (6.0, 5.0, 0.3)]
-    )
-    rng = np.random.default_rng(1)
-    site = make_site(anchors)
-    for _ in range(100):
-        place = (*rng.uniform((1, 1), (8, 7)), rng.uniform(0.5, 1.5))
-        epoch = make_epoch(site, Drive(place), sd_m=0.005, rng=rng)
-        found = fix(shifted(epoch, int(rng.integers(6)), float(rng.uniform(0.2, 3.0))), site, "v")
-        if found.status == "ok":
-            error_m = found.position_m - place
-            assert error_m @ np.linalg.solve(found.covariance, error_m) < 36
+    # the wrong range (the last) drew all descents into the valley of another height, where leaving out another agrees
+    anchors = ((9.36, 20.3, 1.21), (12.46, 8.29, 1.06), (4.55, 19.45, 1.07))
+    anchors += ((24.28, 6.93, 1.32), (5.27, 0.82, 0.09), (2.77, 5.22, 0.07))
+    site = make_site(anchors, bounds_m=((0.0, 0.0, 0.0), (32.0, 32.0, 1.4)))
+    exact = make_epoch(site, Drive((28.48, 1.24, 0.25)), sd_m=0.0065)
+    noise_m = np.array([-0.0021, 0.003, -0.0026, 0.0036, -0.0053, 0.0858])
+    found = fix(replace(exact, range_m=exact.range_m + noise_m), site, "v")
+    assert found.status == "inconsistent"
+    assert np.flatnonzero(~found.used).tolist() == [5]
 
 
 @pytest.mark.parametrize("by_m", [30.0, 300.0])
