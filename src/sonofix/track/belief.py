@@ -150,13 +150,29 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
 
 
 @numba.njit(cache=True, error_model="numpy")
+def drift(mean, covariance, at, rate, free, density, dt):
+    """Let a state age by its rate, in place, with white acceleration of a density; ``free``: it is not sure itself."""
+    n, span = len(mean), abs(dt)
+    mean[at] += dt * mean[rate]
+    for k in range(n):
+        covariance[at, k] += dt * covariance[rate, k]
+    for k in range(n):
+        covariance[k, at] += dt * covariance[k, rate]
+    covariance[rate, rate] += density * span
+    if free:
+        covariance[at, at] += density * span**3 / 3
+        covariance[at, rate] += density * dt * span / 2
+        covariance[rate, at] += density * dt * span / 2
+
+
+@numba.njit(cache=True, error_model="numpy")
 def age(mean, covariance, free, placed, densities, dt):
     """Move a belief's ``mean`` and ``covariance`` by ``dt``, in place.
 
     ``densities`` (4,) are those of `Motion`: along a horizontal axis, upwards, of turns, and of the clock's drift.
     The noise of an integrated pair is that of white acceleration (Bar-Shalom 2001, eq 6.2.2-12).
     """
-    n, span = len(mean), abs(dt)
+    n = len(mean)
     for pair in range(4 * len(placed) + 1):
         vehicle, part = pair // 4, pair % 4
         at, rate = SIZE * vehicle + part, SIZE * vehicle + 4 + part
@@ -167,16 +183,7 @@ def age(mean, covariance, free, placed, densities, dt):
             continue
         if not free[rate]:
             continue
-        mean[at] += dt * mean[rate]
-        for k in range(n):
-            covariance[at, k] += dt * covariance[rate, k]
-        for k in range(n):
-            covariance[k, at] += dt * covariance[k, rate]
-        covariance[rate, rate] += density * span
-        if free[at]:
-            covariance[at, at] += density * span**3 / 3
-            covariance[at, rate] += density * dt * span / 2
-            covariance[rate, at] += density * dt * span / 2
+        drift(mean, covariance, at, rate, free[at], density, dt)
 
 
 def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:

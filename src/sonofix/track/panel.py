@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import SIZE, YAW
 from sonofix.records import Floats
 from sonofix.track import stated
-from sonofix.track.belief import Belief, Motion
+from sonofix.track.belief import Belief, Motion, drift
 from sonofix.track.tilt import step_of
 
 QUICK_M = (0.3, 1.0, 3.0)
@@ -97,17 +97,7 @@ def go(mean, covariance, free, member, dt, densities, tilt, tilt_noise, slot, pa
             at, rate = part, part + 4
             if not free[rate]:
                 continue
-            density = member[k, 3] if part < 2 else densities[part - 2]
-            x[at] += dt * x[rate]
-            for j in range(n):
-                p[at, j] += dt * p[rate, j]
-            for j in range(n):
-                p[j, at] += dt * p[j, rate]
-            p[rate, rate] += density * span
-            if free[at]:
-                p[at, at] += density * span**3 / 3
-                p[at, rate] += density * dt * span / 2
-                p[rate, at] += density * dt * span / 2
+            drift(x, p, at, rate, free[at], member[k, 3] if part < 2 else densities[part - 2], dt)
         if free[8]:
             for pair in range(2):
                 at, rate = 8 + pair, 10 + pair

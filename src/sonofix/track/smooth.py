@@ -177,8 +177,9 @@ def _mean(row: list[tuple[float, Estimate]]) -> Estimate:
     states = row[0][1].states
     each = np.array([np.concatenate([e.position_m, e.velocity_mps]) for _, e in row])
     mean = share @ each
-    at = [("x", "y", "z", "vx", "vy", "vz").index(s) for s in states if s in ("x", "y", "z", "vx", "vy", "vz")]
-    own = [i for i, s in enumerate(states) if s in ("x", "y", "z", "vx", "vy", "vz")]
+    axes = ("x", "y", "z", "vx", "vy", "vz")
+    own = [i for i, state in enumerate(states) if state in axes]
+    at = [axes.index(states[i]) for i in own]
     covariance = np.einsum("k,kij->ij", share, np.array([e.covariance for _, e in row]))
     apart = (each - mean)[:, at]
     covariance[np.ix_(own, own)] += (share[:, None] * apart).T @ apart
