@@ -113,7 +113,7 @@ def test_a_pair_that_is_blocked_is_opened_at_last() -> None:
             np.array([0.01]),
             np.array([1]),
             np.ones(1),
-            stated.FREEDOM,
+            stated.HEAVY,
             np.zeros(1),
             refused,
         )

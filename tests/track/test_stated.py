@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site
 from sonofix.records import Floats
@@ -156,15 +157,39 @@ def test_whom_nothing_moves_is_followed_calmly(rng: np.random.Generator) -> None
     assert street.follower.motion.acceleration_psd < free / 5
 
 
-def test_the_tail_of_noise_weighs_less_and_less() -> None:
+@pytest.mark.parametrize("freedom", stated.FREEDOM)
+def test_the_tail_of_noise_weighs_less_and_less(freedom: float) -> None:
     surprise = np.linspace(0.0, GATE_SIGMA**2, 50)
-    factor = stated.heavier(surprise)
-    assert np.all(factor >= 1.0)
+    factor = stated.heavier(surprise, freedom)
     pull = np.sqrt(surprise) / factor
-    assert np.argmax(pull) < 45
+    assert np.argmax(pull) < 45 or freedom > GATE_SIGMA**2
     # the factor is that of the t density's score: d/dz log p = -z (ν + 1) / (ν + z²)
-    fisher = (stated.FREEDOM + 1.0) / (stated.FREEDOM + 3.0)
-    assert fisher * factor == pytest.approx((stated.FREEDOM + surprise) / (stated.FREEDOM + 1.0))
+    fisher = (freedom + 1.0) / (freedom + 3.0)
+    assert fisher * factor == pytest.approx((freedom + surprise) / (freedom + 1.0))
+
+
+def test_densities_are_those_of_student() -> None:
+    z, sd = np.linspace(-8.0, 8.0, 33), 0.3
+    told = stated.log_likelihood(np.tile(z**2, (2, 1)), np.full((2, len(z)), sd**2))
+    for row, freedom in zip(told, stated.FREEDOM, strict=True):
+        expected = student.logpdf(sd * z, freedom, scale=sd)
+        np.testing.assert_allclose(row - row[0], expected - expected[0], atol=1e-12)
+    np.testing.assert_allclose(
+        told[0] - told[1], student.logpdf(z, stated.HEAVY) - student.logpdf(z, stated.LIGHT), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("heavy", [False, True])
+def test_ranges_tell_what_tails_their_noise_has(heavy: bool, rng: np.random.Generator) -> None:
+    """Noise of 0.15 m, or one range in twelve ten times as far off; what is told of the way stays true."""
+    shape = (COUNT, len(PAIRS))
+    noise = 0.15 * rng.standard_normal(shape) * np.where(rng.random(shape) < heavy / 12, 10.0, 1.0)
+    street, miss, sd, _ = walked(noise, rng)
+    trust = street.follower.belief.trust
+    assert trust is not None
+    assert trust.sizes is None
+    assert (trust.freedom < 6.0) == heavy
+    assert honest(miss, sd)
 
 
 def test_errors_age_to_what_is_known_of_their_variance() -> None:

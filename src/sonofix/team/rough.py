@@ -20,7 +20,7 @@ from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
 from sonofix.team.state import SIZE, SLIP_S, SLIP_SD, SPEED_SLIP, TURN_SLIP, wander_psd
 from sonofix.track.bank import MEMORY_S, PRIOR_DECADES
 from sonofix.track.kernel import absorb
-from sonofix.track.stated import FREEDOM
+from sonofix.track.stated import HEAVY
 
 if TYPE_CHECKING:
     from sonofix.team.fleet import Belief
@@ -47,7 +47,7 @@ def weigh(
     """Correct the members (K, SIZE), (K, SIZE, SIZE) of one robot by rows; add log likelihoods to ``chances`` (K,).
 
     Other robots, and errors of views, are as ``about`` and ``doubt``, the team's mean and covariance before these rows,
-    have them. Noise is Student's t, of `FREEDOM`. The rest is as `hear.hear` has it.
+    have them. Noise is Student's t, of `HEAVY` degrees. The rest is as `hear.hear` has it.
     """
     robots = len(placed)
     both, row = np.zeros(2 * SIZE), np.empty((2, 2 * SIZE))
@@ -102,8 +102,8 @@ def weigh(
                     for q in range(SIZE):
                         total += row[j, m] * covariance[k, m, q] * row[j, q]
                 surprise = off * off / total
-                chances[k] -= 0.5 * ((FREEDOM + 1.0) * np.log1p(surprise / FREEDOM) + np.log(total))
-                heavier = (FREEDOM + 3.0) * (FREEDOM + surprise) / (FREEDOM + 1.0) ** 2
+                chances[k] -= 0.5 * ((HEAVY + 1.0) * np.log1p(surprise / HEAVY) + np.log(total))
+                heavier = (HEAVY + 3.0) * (HEAVY + surprise) / (HEAVY + 1.0) ** 2
                 absorb(mean[k], covariance[k], row[j, :SIZE], off, variance * heavier, work)
 
 

@@ -21,7 +21,7 @@ from sonofix.track.belief import Belief
 from sonofix.track.inputs import WHEELS
 from sonofix.track.kernel import absorb
 
-DECADES = ((-2, -1, 0, 1, 2), (-2, -1, 0, 1, 2), (-2, 0, 2))
+DECADES = ((-2, -1, 0, 1, 2), (-3, -2, -1, 0, 1, 2), (-4, -2, 0, 2))
 """Powers of ten by which members multiply the variances of place and heading, and of the drift of scale and bias."""
 
 PRIOR_DECADES = 1.5
@@ -127,7 +127,7 @@ class Bank:
         self._mean = np.zeros((len(decades), STATES))
         self._covariance = np.zeros((len(decades), STATES, STATES))
         self._now_s: float | None = None
-        self._heard: list[tuple[float, Floats, Floats, float, float]] = []
+        self._heard: list[tuple[float, Floats, Floats, float, float, float]] = []
 
     @property
     def factors(self) -> Floats:
@@ -185,7 +185,7 @@ class Bank:
             own = stated.places(inputs.range_slot, pair, pairs)[:, 0]
             variance = epoch.covariance_m2[i, i] + trust.extra(pair)[0] + before.covariance[np.ix_(own, own)].sum()
             range_m = float(epoch.range_m[i] - before.mean[own].sum())
-            self._heard.append((float(epoch.time_s[i]), other, arm, range_m, float(variance)))
+            self._heard.append((float(epoch.time_s[i]), other, arm, range_m, float(variance), trust.freedom))
         self._heard.sort(key=lambda one: one[0])
 
     def _go(self, until_s: float) -> None:
@@ -211,8 +211,8 @@ class Bank:
                     drive(self._mean, self._covariance, self._factor, arc, constants)
                     now_s = max(time_s, now_s)
                 if heard is not None:
-                    _, other, arm, range_m, variance = heard
-                    hear(self._mean, self._covariance, other, arm, range_m, variance, stated.FREEDOM, self._told)
+                    _, other, arm, range_m, variance, freedom = heard
+                    hear(self._mean, self._covariance, other, arm, range_m, variance, freedom, self._told)
             self._now_s = now_s
             self._told -= self._told.max()
             self._told *= np.exp(-dt / MEMORY_S)

@@ -278,7 +278,7 @@ class Panel:
             variance,
             quick,
             self._news(pair, belief.time_s),
-            stated.FREEDOM,
+            stated.HEAVY,
             self._told,
             self._refused,
         )

@@ -10,6 +10,7 @@ a survey took for the way's scale, all its biases share.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import lgamma, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,19 @@ QUICK_S = 2.0
 SHARED = 1.5
 """Where a `panel` weighs sizes, what all pairs share may be so many times as large as what each errs by."""
 
-FREEDOM = 4.0
-"""Of Student's t distribution, as which noise is taken: outliers of many metres then weigh next to nothing."""
+HEAVY = 4.0
+"""Of Student's t distribution, as which noise is taken first: outliers of many metres then weigh next to nothing."""
+
+LIGHT = 30.0
+"""Of one that is nearly Gaussian, of which every range tells more: noise is taken for it where that is likelier."""
+
+FREEDOM = (HEAVY, LIGHT)
+
+TAILED = 3.0
+"""Logarithm of the odds for heavy tails before anything was heard."""
+
+UNDONE = 20.0
+"""Those odds grow no larger, either way: noise may change."""
 
 REMEMBERED = 100.0
 """Ranges of a pair by which its noise is judged; of all pairs ten times as many."""
@@ -72,8 +84,10 @@ class Trust:
 
     Attributes
     ----------
-    count, square, stated : float64 (P + 1,)
-        Ranges of each pair, faded; sums of their squared residuals and of the variances they stated; last: of all.
+    count, stated : float64 (P + 1,)
+        Ranges of each pair, faded, and sums of the variances they stated; last: of all.
+    square : float64 (2, P + 1)
+        Sums of their squared residuals, as noise of each of `FREEDOM` counts them.
     own, weight : float64 (2, P)
         Sums of squared slow and quick errors, and their number, faded.
     pool : float64 (2,)
@@ -86,6 +100,8 @@ class Trust:
         How often a pair's error has jumped.
     told : float
         Logarithm of the likelihood of the epoch just taken in.
+    tailed : float
+        Logarithm of the odds that noise has the heavier tails.
     sizes : float64 (4,) or None
         Those of all pairs that a `panel` has found: slow and quick deviation (m), quick time (s), density of white
         acceleration (m²/s³); None: each pair's are learnt here.
@@ -101,6 +117,7 @@ class Trust:
     watched_s: Floats
     jumps: int = 0
     told: float = 0.0
+    tailed: float = TAILED
     sizes: Floats | None = None
 
     @property
@@ -111,19 +128,51 @@ class Trust:
         return (self.own + POOL * self.pool[:, None]) / (self.weight + POOL)
 
     @property
-    def every_m2(self) -> float:
-        """Variance that ranges of all pairs have beyond what they state."""
-        return float((self.square[-1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL))
+    def tails(self) -> Floats:
+        """How likely noise of each of `FREEDOM` is (2,); members of a `panel` all take its tails for heavy."""
+        if self.sizes is not None:
+            return np.array([1.0, 0.0])
+        odds = np.array([self.tailed, 0.0])
+        return np.exp(odds - np.logaddexp(*odds))
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that noise has, in the geometric mean."""
+        return float(np.exp(self.tails @ np.log(FREEDOM)))
+
+    @property
+    def every_m2(self) -> Floats:
+        """Variance (2,) that ranges of all pairs have beyond what they state, as noise of each of `FREEDOM`."""
+        return (self.square[:, -1] - self.stated[-1] + POOL * BEGIN_SD_M**2) / (self.count[-1] + POOL)
 
     @property
     def rough_m(self) -> float:
-        """Deviation of all that ranges err by, beyond what they state and share."""
-        return float(np.sqrt(max(self.every_m2, 0.0) + self.pool.sum()))
+        """Deviation of all that ranges err by, beyond what they state and share, outliers aside."""
+        return float(np.sqrt(max(self.every_m2[0], 0.0) + self.pool.sum()))
+
+    def extras(self, pair: NDArray[np.int64]) -> Floats:
+        """Variance (2, n) in m² that rows of some pairs have beyond what they state, as noise of each of `FREEDOM`."""
+        beyond = self.square[:, pair] - self.stated[pair] + POOL * self.every_m2[:, None]
+        return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
 
     def extra(self, pair: NDArray[np.int64]) -> Floats:
         """Variance (n,) in m² that rows of some pairs have beyond what they state."""
-        beyond = self.square[pair] - self.stated[pair] + POOL * self.every_m2
-        return np.maximum(beyond / (self.count[pair] + POOL), 0.0)
+        return self.tails @ self.extras(pair)
+
+    def weighed(self, pair: NDArray[np.int64], miss: Floats, spread: Floats, noise: Floats) -> tuple[Trust, Floats]:
+        """Return what is known once innovations (n,) of variances ``spread`` came, and by what these rows' noise grows.
+
+        That is what Student's t asks for, by squared innovations over their variance; of both `FREEDOM`, weighed by how
+        likely each has been, row by row. Of the tails of noise a row tells as far as ``noise`` (n,) is its variance:
+        by the square of that share, as the kurtosis of a sum has it.
+        """
+        spreads = spread - self.extra(pair) + self.extras(pair)
+        surprise, freedom = miss**2 / spreads, np.array(FREEDOM)[:, None]
+        told = log_likelihood(surprise, spreads)
+        tells = (noise / spread) ** 2
+        larger = 1.0 / (self.tails @ (1.0 / heavier(miss**2 / spread, freedom)))
+        tailed = float(np.clip(self.tailed + (told[0] - told[1]) @ tells, -UNDONE, UNDONE))
+        return replace(self, told=float(np.sum(self.tails @ told)), tailed=tailed), larger
 
     def heard(
         self, pair: NDArray[np.int64], miss: Floats, spread: Floats, time_s: Floats
@@ -157,7 +206,12 @@ class Trust:
         few = min(1.0, POOL / max(float(self.count[-1]), 1e-9))
         begun = trust(len(self.count) - 1)
         return replace(
-            begun, count=few * self.count, square=few * self.square, stated=few * self.stated, sizes=self.sizes
+            begun,
+            count=few * self.count,
+            square=few * self.square,
+            stated=few * self.stated,
+            sizes=self.sizes,
+            tailed=self.tailed,
         )
 
     def after(self, pair: NDArray[np.int64], square: Floats, stated: Floats, errors: Floats) -> Trust:
@@ -171,15 +225,15 @@ class Trust:
         errors : float64 (2, n)
             The same of the rows' slow and quick errors: square of the mean, and variance.
         """
-        noise = stated + self.extra(pair)
-        counted = (FREEDOM + 1.0) / (FREEDOM + square / noise) * square
+        freedom = np.array(FREEDOM)[:, None]
+        counted = (freedom + 1.0) / (freedom + square / (stated + self.extras(pair))) * square
         count, squares, claims = self.count.copy(), self.square.copy(), self.stated.copy()
         own, weight, pool = self.own.copy(), self.weight.copy(), self.pool.copy()
         errors = np.minimum(errors, MOST * self.variance[:, pair])
         for i, k in enumerate(pair.tolist()):
             for at, keep in ((k, 1.0 - 1.0 / REMEMBERED), (-1, 1.0 - 0.1 / REMEMBERED)):
                 count[at] = keep * count[at] + 1.0
-                squares[at] = keep * squares[at] + counted[i]
+                squares[:, at] = keep * squares[:, at] + counted[:, i]
                 claims[at] = keep * claims[at] + stated[i]
             own[:, k] = (1.0 - RATE) * own[:, k] + errors[:, i]
             weight[:, k] = (1.0 - RATE) * weight[:, k] + 1.0
@@ -192,7 +246,7 @@ def trust(pairs: int) -> Trust:
     every, each = np.zeros(pairs + 1), np.zeros((KINDS, pairs))
     return Trust(
         every,
-        every,
+        np.zeros((len(FREEDOM), pairs + 1)),
         every,
         each,
         each,
@@ -261,16 +315,20 @@ def show(
     return shown * (1.0 + mean[slot]) + mean[slot + 1] + mean[at].sum(axis=0), derivative
 
 
-def heavier(surprise: Floats) -> Floats:
+def heavier(surprise: Floats, freedom: Floats | float) -> Floats:
     """Return the factor on a row's variance that Student's t asks for, by its squared innovation over its variance.
 
     Noise of known weights (ν + 1) / (ν + z²) would tell (ν + 3) / (ν + 1) times what such a row tells (Fisher's
     information of t about its place: Lange, Little and Taylor 1989), so it is larger by that.
     """
-    return (FREEDOM + 3.0) / (FREEDOM + 1.0) * (FREEDOM + surprise) / (FREEDOM + 1.0)
+    return (freedom + 3.0) / (freedom + 1.0) * (freedom + surprise) / (freedom + 1.0)
 
 
-def log_likelihood(surprise: Floats, variance: Floats) -> float:
-    """Sum of rows' logarithms of Student's t density, but for a constant a row."""
-    each = (FREEDOM + 1.0) * np.log1p(surprise / FREEDOM) + np.log(variance)
-    return float(-0.5 * np.sum(each))
+def log_likelihood(surprise: Floats, variance: Floats) -> Floats:
+    """Logarithms (2, n) of rows' Student's t density, of each of `FREEDOM`, but for a constant.
+
+    ``surprise`` and ``variance`` (2, n).
+    """
+    freedom = np.array(FREEDOM)[:, None]
+    lead = np.array([lgamma((nu + 1.0) / 2) - lgamma(nu / 2) - 0.5 * log(nu) for nu in FREEDOM])[:, None]
+    return lead - 0.5 * ((freedom + 1.0) * np.log1p(surprise / freedom) + np.log(variance))

@@ -90,8 +90,8 @@ def update(
     asked = (links, dt, measured, pair)
     if trust is not None:
         # the noise of others' ranges has heavy tails: what is far off counts less before it counts for nothing
-        trust = replace(trust, told=stated.log_likelihood(surprise, spread))
-        noise[np.diag_indices(len(rows))] *= stated.heavier(surprise)
+        trust, larger = trust.weighed(pair, miss, spread, noise.diagonal())
+        noise[np.diag_indices(len(rows))] *= larger
         belief = replace(belief, trust=trust)
     if not near.any():
         return belief, used, surprise
@@ -136,7 +136,7 @@ def linear(
     pair = pairs_of(belief, epoch, rows)
     variance = noise_of(belief, epoch, links, rows, dt, pair).diagonal()
     if belief.trust is not None:
-        variance = variance + belief.trust.extra(pair)
+        variance = variance + belief.trust.extras(pair)[0]
     shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
     return derivative, epoch.range_m[rows] - shown + derivative @ belief.mean, variance, pair
 
