@@ -3,27 +3,28 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
+FRESH := .venv/.fresh
 # many small matrix products: threads inside each would only wait for each other
 export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo test check prove bench format lock clean
 
-demo: $(STAMP)  ## simulate a hall, run the receiver on it, show picture and table
+demo: $(FRESH)  ## simulate a hall, run the receiver on it, show picture and table
 	$(BIN)/sonofix demo
 
 test: check  ## every check and every test
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
-check: $(STAMP)
+check: $(FRESH)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-prove: $(STAMP)  ## long statistics (many minutes); prints tables and renews docs/statistics.md
+prove: $(FRESH)  ## long statistics (many minutes); prints tables and renews docs/statistics.md
 	$(BIN)/python benchmarks/prove.py docs/statistics.md
 
-bench: $(STAMP)  ## benchmarks against peers and floors in the same run (a quarter of an hour); renews the documents' tables
+bench: $(FRESH)  ## benchmarks against peers and floors in the same run (a quarter of an hour); renews the documents' tables
 	$(BIN)/python benchmarks/street.py --into docs/benchmarks.md
 	$(BIN)/python benchmarks/updates.py --into docs/benchmarks.md
 	$(BIN)/python benchmarks/adaptive.py --into docs/studies.md
@@ -47,6 +48,11 @@ $(STAMP): pyproject.toml requirements.lock
 	  $(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock; \
 	  $(BIN)/python -m pip install --quiet --no-deps -e .; \
 	fi
+	@touch $@
+
+# a compiled kernel is renewed when its own file changes, not when one that it inlines does: after a change all go
+$(FRESH): $(STAMP) $(shell grep -rl --include='*.py' njit src)
+	@find src \( -name '*.nbi' -o -name '*.nbc' \) -delete
 	@touch $@
 
 clean:
