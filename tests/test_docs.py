@@ -153,7 +153,7 @@ def test_rooms_named_exist_and_existing_rooms_are_named():
     named = set(re.findall(r"^\| \[`([\w./]+)`\]", text, re.MULTILINE))
     package = ROOT / "src" / "sonofix"
     there = {f"{p.name}/" for p in package.iterdir() if p.is_dir() and (p / "__init__.py").exists()}
-    there |= {p.name for p in package.glob("*.py") if p.name != "__init__.py"}
+    there |= {p.name for p in package.glob("*.py") if not p.name.startswith("__")}
     assert named == there
 
 

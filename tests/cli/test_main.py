@@ -31,6 +31,11 @@ def test_version():
     assert told.stdout.startswith("sonofix 0.")
 
 
+def test_the_package_is_a_command_too():
+    told = subprocess.run([sys.executable, "-m", "sonofix", "--version"], capture_output=True, text=True, check=True)
+    assert told.stdout.startswith("sonofix 0.")
+
+
 def test_unknown_command_is_a_usage_mistake():
     told = runner.invoke(app, ["rum"])
     assert told.exit_code == 2
