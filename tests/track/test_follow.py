@@ -140,9 +140,11 @@ def test_a_single_heard_beacon_keeps_the_track_going(rng: np.random.Generator) -
         assert s.only.sd("x") < 0.3
 
 
-def test_ranges_too_few_for_any_epochs_fix_are_gathered(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("together", [1, 2], ids=["one at a time", "two, which leave a mirror image"])
+def test_ranges_too_few_for_any_epochs_fix_are_gathered(together: int, rng: np.random.Generator) -> None:
     site = make_site(HALL, level_m=1.1)
-    epochs = [rows_of(e, [k % 6]) for k, e in enumerate(drive_past(site, Drive(PLACE), 8, rng, stated=True))]
+    passed = drive_past(site, Drive(PLACE), 8, rng, stated=True)
+    epochs = [rows_of(e, [(together * k + i) % 6 for i in range(together)]) for k, e in enumerate(passed)]
     seen = list(follow(Follower(site), epochs))
     assert not seen[0].estimates
     begun = next(k for k, s in enumerate(seen) if s.estimates)

@@ -359,7 +359,8 @@ class Follower:
                 continue
             start = found
             again = lost and self._corrected
-            if (found.status == "too-few" or again) and np.any(self._touches(links, who)):
+            poor = found.status in ("too-few", "ambiguous") and not self.free_running
+            if (poor or again) and np.any(self._touches(links, who)):
                 start = self._gathered(found.vehicle)
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue

@@ -253,7 +253,7 @@ class Problem:
                 if begun is not None and np.isfinite(first) and np.isfinite(second):
                     self._chord(k, begun, who, first, second)
                 continue
-            if begun is not None and np.all(np.isfinite([first, second, third])) and third <= wheels.LONGEST_S:
+            if begun is not None and np.all(np.isfinite([first, second, third])) and 0.0 < third <= wheels.LONGEST_S:
                 self._arc(k, begun, who, (first, second, third))
             if fourth > 0:
                 # what turns unseen does so after this knot: no arc begins here
