@@ -241,6 +241,9 @@ class Problem:
         node, inputs = self.nodes[k], self._passage.follower.belief.inputs
         if inputs is None:
             return
+        if not node.belief.heeded:
+            self._begun.clear()  # sensors that ranges gainsay are not heard
+            return
         for row in node.mark.rows:
             kind, who = int(inputs.kind[row]), int(inputs.vehicle[row])
             first, second, third, fourth = inputs.value[row].tolist()

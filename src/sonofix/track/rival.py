@@ -49,12 +49,12 @@ class Rival:
     def take(
         self, time_s: float, motion: Motion, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], others: float
     ) -> tuple[Rival, NDArray[np.bool_]]:
-        """Follow an epoch of which the track made the log likelihood ``others``; return the rows used, too."""
+        """Follow an epoch of which the track made the bounded log likelihood ``others``; return the rows used, too."""
         belief, used, _ = update(predict(self.belief, max(time_s, self.belief.time_s), motion), epoch, links, asked)
         trust = belief.trust
         if trust is None or trust.count[-1] < HEARD:
             return replace(self, belief=belief), used
-        return replace(self, belief=belief, ahead=self.ahead + trust.told - others), used
+        return replace(self, belief=belief, ahead=self.ahead + trust.bounded - others), used
 
     @property
     def won(self) -> bool:

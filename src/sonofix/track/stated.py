@@ -43,6 +43,11 @@ SHARED = 1.5
 FREEDOM = 4.0
 """Of Student's t distribution, as which noise is taken: outliers of many metres then weigh next to nothing."""
 
+STRAY = float(np.log(0.05 / 100.0 / 0.375))
+"""Logarithm of the density, over that of Student's t at 0, of a range that may be anything within 100 m.
+
+One in twenty is."""
+
 REMEMBERED = 100.0
 """Ranges of a pair by which its noise is judged; of all pairs ten times as many."""
 
@@ -86,6 +91,8 @@ class Trust:
         How often a pair's error has jumped.
     told : float
         Logarithm of the likelihood of the epoch just taken in.
+    bounded : float
+        The same, with no range below `STRAY`: how wide a belief is, is no reason to be told by outliers.
     sizes : float64 (4,) or None
         Those of all pairs that a `panel` has found: slow and quick deviation (m), quick time (s), density of white
         acceleration (m²/s³); None: each pair's are learnt here.
@@ -101,6 +108,7 @@ class Trust:
     watched_s: Floats
     jumps: int = 0
     told: float = 0.0
+    bounded: float = 0.0
     sizes: Floats | None = None
 
     @property
@@ -270,7 +278,7 @@ def heavier(surprise: Floats) -> Floats:
     return (FREEDOM + 3.0) / (FREEDOM + 1.0) * (FREEDOM + surprise) / (FREEDOM + 1.0)
 
 
-def log_likelihood(surprise: Floats, variance: Floats) -> float:
-    """Sum of rows' logarithms of Student's t density, but for a constant a row."""
-    each = (FREEDOM + 1.0) * np.log1p(surprise / FREEDOM) + np.log(variance)
-    return float(-0.5 * np.sum(each))
+def log_likelihood(surprise: Floats, variance: Floats) -> tuple[float, float]:
+    """Sum of rows' logarithms of Student's t density, but for a constant a row; and the same, none below `STRAY`."""
+    each = -0.5 * ((FREEDOM + 1.0) * np.log1p(surprise / FREEDOM) + np.log(variance))
+    return float(np.sum(each)), float(np.sum(np.maximum(each, STRAY)))

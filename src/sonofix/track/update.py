@@ -56,7 +56,7 @@ def update(
     clock, with_rates = epoch.clock == "common", epoch.range_rate_mps is not None
     if not len(rows) or (clock and not belief.free[-2]):
         if belief.trust is not None:
-            belief = replace(belief, trust=replace(belief.trust, told=0.0))
+            belief = replace(belief, trust=replace(belief.trust, told=0.0, bounded=0.0))
         return belief, used, np.zeros(0)
     dt = epoch.time_s[rows] - belief.time_s
     pair = pairs_of(belief, epoch, rows)
@@ -90,7 +90,8 @@ def update(
     asked = (links, dt, measured, pair)
     if trust is not None:
         # the noise of others' ranges has heavy tails: what is far off counts less before it counts for nothing
-        trust = replace(trust, told=stated.log_likelihood(surprise, spread))
+        told, bounded = stated.log_likelihood(surprise, spread)
+        trust = replace(trust, told=told, bounded=bounded)
         noise[np.diag_indices(len(rows))] *= stated.heavier(surprise)
         belief = replace(belief, trust=trust)
     if not near.any():
