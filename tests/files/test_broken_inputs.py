@@ -401,6 +401,11 @@ FLAGGED: list[tuple[str, Callable[[Path], None], str]] = [
     ("FLAC header states too much", bytes_of(flac_total(10**6), flac=True), "cut off or damaged"),
     ("FLAC header states too little", bytes_of(flac_total(1000), flac=True), "less than one period"),
     ("wrong rate in the header", samples(lambda x: x, rate=44100), "Capture: 0.218 s"),
+    (
+        "odometry on another clock",
+        put("odometry.csv", ODOMETRY + "1.7e9,1,0\n1700000001,1,0\n"),
+        "tells nothing of the time of what is heard",
+    ),
     ("beacons in one point", in_one_place, "stand in one point"),
     ("beacons on one line", on_one_line, "stand on one line"),
     ("beacon far outside", edit("[4.0, 0.0, 2.4]", "[14.0, 0.0, 2.4]"), "outside the site's bounds_m"),

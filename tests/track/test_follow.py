@@ -228,6 +228,20 @@ def test_one_epoch_heard_from_elsewhere_leaves_no_trace(rng: np.random.Generator
         assert sigmas(s.only, np.array(PLACE)) < 5
 
 
+@pytest.mark.parametrize("clock_m", [None, 20.0])
+@pytest.mark.parametrize("hours", [2.0, 24.0, 470_000.0], ids=["an hour or two", "a day", "since 1970"])
+def test_after_hours_of_silence_a_track_begins_anew(
+    hours: float, clock_m: float | None, rng: np.random.Generator
+) -> None:
+    site, later = make_site(HALL, level_m=1.1), 3600.0 * hours
+    epochs = [make_epoch(site, Drive(PLACE), 0.5 * k, clock_m=clock_m, rng=rng) for k in range(4)]
+    epochs += [make_epoch(site, Drive((5.0, 5.0, 1.1)), later + 0.5 * k, clock_m=clock_m, rng=rng) for k in range(4)]
+    seen = list(follow(Follower(site), epochs))
+    assert {"lost", "start"} <= set(seen[4].words)
+    for s in seen[4:]:
+        assert np.hypot(*(s.only.position_m - (5.0, 5.0, 1.1))[:2]) < 0.05
+
+
 def test_a_lone_microphone_off_the_axis_is_followed_and_the_origin_told(rng: np.random.Generator) -> None:
     site = make_site(HALL, arms_m=((0.4, -0.1, 0.5),), level_m=1.1)
     drive = Drive((2.0, 2.0, 1.1), (0.6, 0.45, 0.0), yaw_rad=float(np.arctan2(0.45, 0.6)))

@@ -304,6 +304,22 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
 
 
+def unplaced(belief: Belief, vehicle: int) -> Belief:
+    """Return a belief to which a vehicle's place is not known, as before anything was heard of it."""
+    own = np.arange(SIZE * vehicle, SIZE * (vehicle + 1))
+    mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
+    mean[np.delete(own, 2)] = 0.0  # a level that is stated stays
+    covariance[own, :] = covariance[:, own] = 0.0
+    free[own] = False
+    if belief.inputs is not None:
+        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
+        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
+        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
+    placed = belief.placed.copy()
+    placed[vehicle] = False
+    return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
+
+
 def loosen(belief: Belief, vehicle: int) -> Belief:
     """Return a belief in which a fix only says where a vehicle's track begins: it knew nothing of lasting errors."""
     covariance, at = belief.covariance.copy(), SIZE * vehicle

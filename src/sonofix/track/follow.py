@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, link, open_arms, row_times, rows_at, turning
+from sonofix.geometry import SIZE, Links, link, open_arms, row_times, rows_at, turning
 from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
@@ -15,7 +15,7 @@ from sonofix.site import Site
 from sonofix.track import stated
 from sonofix.track.alone import Alone, Silence, apart, unled
 from sonofix.track.bank import Bank
-from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
+from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at, unplaced
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
@@ -38,6 +38,9 @@ AGILITY = (1e-3, 2.0)
 
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
+
+FORGOTTEN_M = 1e4
+"""Deviation at which nothing is left of a place: after an hour of silence, or where the clock was set."""
 
 GATHER_S = 5.0
 """Where single epochs are too poor for a fix, ranges of this long are gathered for one."""
@@ -135,6 +138,7 @@ class Follower:
             # a recording may begin before its clock's zero
             self.belief = replace(self.belief, time_s=min(self.belief.time_s, time_s))
         self.belief = predict(self.belief, max(time_s, self.belief.time_s), self.motion)
+        self._forget(events)
         candidates = np.isfinite(epoch.range_m)
         for found in fixes:
             if found.status == "ok":
@@ -212,6 +216,18 @@ class Follower:
         text = f"{np.count_nonzero(refused)} ranges disagreed: {apart:.2f} m from where its own sensors had it"
         events.append(Event(before.time_s, self.site.vehicles[who].id, "slip", text))
         return again
+
+    def _forget(self, events: list[Event]) -> None:
+        """Let vehicles begin anew of whose place nothing is known any more."""
+        for who in np.flatnonzero(self.belief.placed).tolist():
+            own = slice(SIZE * who, SIZE * who + 2)
+            sd_m = float(np.sqrt(np.trace(self.belief.covariance[own, own])))
+            if sd_m < FORGOTTEN_M:
+                continue
+            self.belief = unplaced(self.belief, who)
+            self._rival, self._alone, self._undecided[who], self._heard[who] = None, None, False, False
+            text = f"not heard for too long: its place is known to {sd_m:.0f} m"
+            events.append(Event(self.belief.time_s, self.site.vehicles[who].id, "lost", text))
 
     def _try_start(self, fixes: tuple[Fix, ...]) -> None:
         """Where the first fix by ranges that others state is far from a stated start, let the two contest."""
