@@ -140,9 +140,11 @@ def test_a_single_heard_beacon_keeps_the_track_going(rng: np.random.Generator) -
         assert s.only.sd("x") < 0.3
 
 
-def test_ranges_too_few_for_any_epochs_fix_are_gathered(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("together", [1, 2], ids=["one at a time", "two, which leave a mirror image"])
+def test_ranges_too_few_for_any_epochs_fix_are_gathered(together: int, rng: np.random.Generator) -> None:
     site = make_site(HALL, level_m=1.1)
-    epochs = [rows_of(e, [k % 6]) for k, e in enumerate(drive_past(site, Drive(PLACE), 8, rng, stated=True))]
+    passed = drive_past(site, Drive(PLACE), 8, rng, stated=True)
+    epochs = [rows_of(e, [(together * k + i) % 6 for i in range(together)]) for k, e in enumerate(passed)]
     seen = list(follow(Follower(site), epochs))
     assert not seen[0].estimates
     begun = next(k for k, s in enumerate(seen) if s.estimates)
@@ -224,6 +226,20 @@ def test_one_epoch_heard_from_elsewhere_leaves_no_trace(rng: np.random.Generator
     for s in seen[7:]:
         assert s.used.all()
         assert sigmas(s.only, np.array(PLACE)) < 5
+
+
+@pytest.mark.parametrize("clock_m", [None, 20.0])
+@pytest.mark.parametrize("hours", [2.0, 24.0, 470_000.0], ids=["an hour or two", "a day", "since 1970"])
+def test_after_hours_of_silence_a_track_begins_anew(
+    hours: float, clock_m: float | None, rng: np.random.Generator
+) -> None:
+    site, later = make_site(HALL, level_m=1.1), 3600.0 * hours
+    epochs = [make_epoch(site, Drive(PLACE), 0.5 * k, clock_m=clock_m, rng=rng) for k in range(4)]
+    epochs += [make_epoch(site, Drive((5.0, 5.0, 1.1)), later + 0.5 * k, clock_m=clock_m, rng=rng) for k in range(4)]
+    seen = list(follow(Follower(site), epochs))
+    assert {"lost", "start"} <= set(seen[4].words)
+    for s in seen[4:]:
+        assert np.hypot(*(s.only.position_m - (5.0, 5.0, 1.1))[:2]) < 0.05
 
 
 def test_a_lone_microphone_off_the_axis_is_followed_and_the_origin_told(rng: np.random.Generator) -> None:

@@ -119,6 +119,12 @@ def test_gaps_and_empty_cells_tell_nothing(rng: np.random.Generator) -> None:
     times = np.array([0.0, 0.05, 0.1, 2.0, 2.05, 2.1])
     _, turn, _ = gyro.summed(times, np.array([1.0, np.nan, 1.0, 1.0, 1.0, 1.0]))
     np.testing.assert_array_equal(np.isnan(turn), [True, False, True, True, False, False])
+    # a row that stands there twice, at the end of all
+    _, turn, dt = gyro.summed(np.array([0.0, 0.05, 0.05]), np.ones(3))
+    np.testing.assert_array_equal(dt[1:], [0.05, 0.0])
+    mean, covariance, free = np.zeros(12), np.eye(12), np.ones(12, bool)
+    gyro.take(mean, covariance, free, 0, 8, float(turn[2]), float(dt[2]))
+    assert not mean.any()
     table = imu(rng)
     columns = {name: values.copy() for name, values in table.columns.items()}
     columns["gz_radps"][300:700] = np.nan

@@ -140,6 +140,19 @@ def test_odometry_carries_through_silence(rng: np.random.Generator) -> None:
     assert (got.sd("x") or 1.0) < 0.2
 
 
+def test_a_row_that_stands_there_twice_changes_nothing(rng: np.random.Generator) -> None:
+    drive, ends = Drive((1.0, 1.0, 1.1), (0.4, 0.3, 0.0)), []
+    once = driving(0.08, drive, 6.0)
+    twice = Table({name: np.repeat(values, 2) for name, values in once.columns.items()}, {"vehicle": ("v",) * 120})
+    epochs = [make_epoch(SITE, drive, 0.05 + 0.5 * k, rng=rng) for k in range(11)]
+    for table in (once, twice):
+        street = Street(SITE)
+        street.sense({"odometry": table})
+        ends.append([street.walk(epoch) for epoch in epochs][-1].estimates[0])
+    np.testing.assert_allclose(ends[1].position_m, ends[0].position_m, atol=1e-9)
+    np.testing.assert_allclose(ends[1].covariance, ends[0].covariance, atol=1e-9)
+
+
 def test_a_compass_gives_the_heading_and_its_bad_readings_do_not(rng: np.random.Generator) -> None:
     times = np.arange(0.0, 10.0, 0.1)
     heading = 0.7 + 0.03 * rng.standard_normal(len(times))

@@ -28,6 +28,7 @@ def oddities(
     sentences = [*_places(site), *_schedule(site, references), *_air(site), *_chips(site)]
     if figures is not None:
         sentences += [*_samples(recording, figures), *_sync(recording, figures)]
+    sentences += _sensors(recording, figures)
     if not has_truth:
         sentences.append("there is no truth.csv, so errors cannot be told")
     return sentences
@@ -184,6 +185,23 @@ def _samples(recording: Recording, figures: CaptureFigures) -> Iterator[str]:
     period_s = site.schedule.period_s if site.schedule else None
     if period_s is not None and figures.sample_count < period_s * rate_hz:
         yield f"the capture lasts {figures.sample_count / rate_hz:.4g} s, less than one period of {period_s:g} s"
+
+
+def _sensors(recording: Recording, figures: CaptureFigures | None) -> Iterator[str]:
+    if figures is not None and recording.rate_hz is not None:
+        first_s, last_s = 0.0, figures.sample_count / recording.rate_hz
+    elif recording.ranges is not None:
+        first_s, last_s = float(recording.ranges.time_s.min()), float(recording.ranges.time_s.max())
+    else:
+        return
+    for stem in ("odometry", "steps", "compass", "imu"):
+        if stem in recording.tables:
+            told_s = recording.tables[stem].columns["time_s"]
+            if told_s[0] > last_s or told_s[-1] < first_s:
+                yield (
+                    f"{stem}.csv (from {told_s[0]:.9g} to {told_s[-1]:.9g} s) tells nothing of the time of what is "
+                    f"heard (from {first_s:.9g} to {last_s:.9g} s); both have to stand on one clock"
+                )
 
 
 def _sync(recording: Recording, figures: CaptureFigures) -> Iterator[str]:

@@ -21,6 +21,13 @@ MOST_PROBLEMS = 5
 
 TEXT_COLUMNS = ("from", "to", "vehicle")
 
+LATEST_S, FARTHEST_M, FASTEST_MPS, FASTEST_RADPS, WIDEST_RAD = 1e10, 1e8, 1e3, 1e2, 1e2
+"""No value of a table is larger: year 2286 since 1970, twice the way around the earth, what gyros measure at most (35
+rad/s), 16 turns. Beyond is another unit, as degrees are, or a slip."""
+
+TIME = {"time_s": (-LATEST_S, LATEST_S, "s")}
+HEADING = {"heading_rad": (-WIDEST_RAD, WIDEST_RAD, "rad, not degrees")}
+
 
 @dataclass(frozen=True, slots=True)
 class Layout:
@@ -53,13 +60,19 @@ class Layout:
 
 
 LAYOUTS = {
-    "sync": Layout(("time_s",), strictly=True),
+    "sync": Layout(("time_s",), strictly=True, bounds=TIME),
     "ranges": Layout(
         ("time_s", "from", "to"),
         ("sd_m",),
         one_of=("range_m", "time_of_flight_s"),
         key="to",
-        bounds={"sd_m": (1e-9, np.inf, "m")},
+        bounds={
+            **TIME,
+            "sd_m": (1e-9, FARTHEST_M, "m"),
+            # with an unknown clock, its offset too
+            "range_m": (-1e4 * FARTHEST_M, 1e4 * FARTHEST_M, "m"),
+            "time_of_flight_s": (-LATEST_S, LATEST_S, "s"),
+        },
     ),
     "bearings": Layout(("time_s", "from", "to", "bearing_rad"), given=("time_s", "bearing_rad"), key="to"),
     "exchanges": Layout(
@@ -70,16 +83,41 @@ LAYOUTS = {
         key="from",
         bounds={"heard_sd_s": (1e-12, np.inf, "s"), "reply_heard_sd_s": (1e-12, np.inf, "s")},
     ),
-    "odometry": Layout(("time_s", "v_mps", "yaw_rate_radps"), per_vehicle=True, key="vehicle"),
+    "odometry": Layout(
+        ("time_s", "v_mps", "yaw_rate_radps"),
+        per_vehicle=True,
+        key="vehicle",
+        bounds={
+            **TIME,
+            "v_mps": (-FASTEST_MPS, FASTEST_MPS, "m/s"),
+            "yaw_rate_radps": (-FASTEST_RADPS, FASTEST_RADPS, "rad/s"),
+        },
+    ),
     "steps": Layout(
-        ("time_s", "length_m", "heading_rad"), per_vehicle=True, key="vehicle", bounds={"length_m": (0.0, np.inf, "m")}
+        ("time_s", "length_m", "heading_rad"),
+        per_vehicle=True,
+        key="vehicle",
+        bounds={**TIME, **HEADING, "length_m": (0.0, 100.0, "m")},
     ),
-    "compass": Layout(("time_s", "heading_rad"), per_vehicle=True, key="vehicle"),
+    "compass": Layout(("time_s", "heading_rad"), per_vehicle=True, key="vehicle", bounds={**TIME, **HEADING}),
     "imu": Layout(
-        ("time_s", "gx_radps", "gy_radps", "gz_radps", "ax_mps2", "ay_mps2", "az_mps2"), per_vehicle=True, key="vehicle"
+        ("time_s", "gx_radps", "gy_radps", "gz_radps", "ax_mps2", "ay_mps2", "az_mps2"),
+        per_vehicle=True,
+        key="vehicle",
+        bounds={**TIME, **{f"g{axis}_radps": (-FASTEST_RADPS, FASTEST_RADPS, "rad/s") for axis in "xyz"}},
     ),
-    "temperature": Layout(("time_s", "temperature_c"), bounds={"temperature_c": (-40.0, 60.0, "°C")}),
-    "start": Layout(("x_m", "y_m", "yaw_rad"), ("z_m",), given=("x_m", "y_m"), per_vehicle=True, order=None),
+    "temperature": Layout(("time_s", "temperature_c"), bounds={**TIME, "temperature_c": (-40.0, 60.0, "°C")}),
+    "start": Layout(
+        ("x_m", "y_m", "yaw_rad"),
+        ("z_m",),
+        given=("x_m", "y_m"),
+        per_vehicle=True,
+        order=None,
+        bounds={
+            **{f"{axis}_m": (-FARTHEST_M, FARTHEST_M, "m") for axis in "xyz"},
+            "yaw_rad": (-WIDEST_RAD, WIDEST_RAD, "rad, not degrees"),
+        },
+    ),
     "truth": Layout(
         ("time_s", "x_m", "y_m", "z_m"),
         ("yaw_rad", "roll_rad", "pitch_rad"),

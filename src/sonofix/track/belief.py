@@ -82,6 +82,8 @@ class Belief:
         What has been learnt of ranges that others state; None where ranges are our own.
     rough : float64 (V, 3) or None
         Factors on the noise of each vehicle's odometry that were learnt (`bank`); None: it is as expected.
+    heeded : bool
+        Whether what sensors tell enters.
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -96,6 +98,7 @@ class Belief:
     tilt_sd_rad: Floats | None = None
     trust: Trust | None = None
     rough: Floats | None = None
+    heeded: bool = True
 
     def tilts(self, vehicle: int) -> float:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
@@ -192,7 +195,9 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     What sensors told of the motion on the way enters at its own time.
     """
     dt = time_s - belief.time_s
-    told = range(0) if belief.inputs is None else belief.inputs.within(belief.time_s, time_s)
+    told = range(0)
+    if belief.inputs is not None and belief.heeded:
+        told = belief.inputs.within(belief.time_s, time_s)
     if (abs(dt) < INSTANT_S and not told) or not belief.placed.any():
         return replace(belief, time_s=time_s)
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free
@@ -296,6 +301,22 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
         open_tilt(covariance, free, vehicle, belief.tilts(vehicle), tilt_pace_radps)
     placed = belief.placed.copy()
     placed[vehicle] = True
+    return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
+
+
+def unplaced(belief: Belief, vehicle: int) -> Belief:
+    """Return a belief to which a vehicle's place is not known, as before anything was heard of it."""
+    own = np.arange(SIZE * vehicle, SIZE * (vehicle + 1))
+    mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
+    mean[np.delete(own, 2)] = 0.0  # a level that is stated stays
+    covariance[own, :] = covariance[:, own] = 0.0
+    free[own] = False
+    if belief.inputs is not None:
+        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
+        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
+        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
+    placed = belief.placed.copy()
+    placed[vehicle] = False
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
 
 

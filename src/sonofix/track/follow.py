@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import Links, link, open_arms, row_times, rows_at, turning
+from sonofix.geometry import SIZE, Links, link, open_arms, row_times, rows_at, turning
 from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track import stated
+from sonofix.track.alone import Alone, Silence, apart, unled
 from sonofix.track.bank import Bank
-from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at
+from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at, unplaced
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
@@ -37,6 +38,9 @@ AGILITY = (1e-3, 2.0)
 
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
+
+FORGOTTEN_M = 1e4
+"""Deviation at which nothing is left of a place: after an hour of silence, or where the clock was set."""
 
 GATHER_S = 5.0
 """Where single epochs are too poor for a fix, ranges of this long are gathered for one."""
@@ -71,6 +75,7 @@ class Follower:
         self._looked_s = -np.inf
         self._pushed: Floats | None = None
         self._begun_s = np.full(len(site.vehicles), -np.inf)
+        self._given = np.zeros(len(site.vehicles), bool)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
         self._banks: dict[int, Bank] = {}
@@ -80,6 +85,8 @@ class Follower:
         alone = len(site.vehicles) == 1 and site.clock_known and inputs is not None and not len(inputs.time_s)
         few = inputs is not None and inputs.range_slot >= 0 and len(inputs.pairs) <= MOST_PAIRS
         self._panel = Panel() if alone and few else None
+        self._alone: Alone | None = None
+        self._silence = Silence()
 
     def knowing(self, other: Follower, sizes: Floats | None = None) -> Follower:
         """Return this follower, at its beginning, with what another has learnt of the same recording by its end.
@@ -103,6 +110,7 @@ class Follower:
         """Place a vehicle at a pose known beforehand."""
         who = [v.id for v in self.site.vehicles].index(vehicle)
         known = self.site.vehicles[who].z_m is not None
+        self._given[who] = True
         inputs = self.belief.inputs
         turns = bool(turning(self.site)[who]) or (inputs is not None and bool(inputs.headed[who]))
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -130,6 +138,7 @@ class Follower:
             # a recording may begin before its clock's zero
             self.belief = replace(self.belief, time_s=min(self.belief.time_s, time_s))
         self.belief = predict(self.belief, max(time_s, self.belief.time_s), self.motion)
+        self._forget(events)
         candidates = np.isfinite(epoch.range_m)
         for found in fixes:
             if found.status == "ok":
@@ -140,15 +149,18 @@ class Follower:
         # ranges that placed a vehicle have had their say
         before = self.belief
         self.belief, used, _ = update(before, epoch, links, candidates & ~taken)
-        if before.inputs is not None and len(before.inputs.time_s):
+        if before.inputs is not None and len(before.inputs.time_s) and before.heeded:
             used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
         used |= taken
         if taken.any() or any(event.event in ("slip", "reset") for event in events):
             # a rival knows nothing of that
             self._rival, self._undecided[:] = None, False
+        self._try_start(fixes)
         self._loosen(before)
         used = self._contest(epoch, links, candidates, used, events)
-        self.belief = self._course.head(self.belief)
+        self._heed(epoch, links, candidates & ~taken, events)
+        if self.belief.heeded:
+            self.belief = self._course.head(self.belief)
         self._doubt_wheels(before, epoch, links, candidates, events)
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
@@ -205,6 +217,27 @@ class Follower:
         events.append(Event(before.time_s, self.site.vehicles[who].id, "slip", text))
         return again
 
+    def _forget(self, events: list[Event]) -> None:
+        """Let vehicles begin anew of whose place nothing is known any more."""
+        for who in np.flatnonzero(self.belief.placed).tolist():
+            own = slice(SIZE * who, SIZE * who + 2)
+            sd_m = float(np.sqrt(np.trace(self.belief.covariance[own, own])))
+            if sd_m < FORGOTTEN_M:
+                continue
+            self.belief = unplaced(self.belief, who)
+            self._rival, self._alone, self._undecided[who], self._heard[who] = None, None, False, False
+            text = f"not heard for too long: its place is known to {sd_m:.0f} m"
+            events.append(Event(self.belief.time_s, self.site.vehicles[who].id, "lost", text))
+
+    def _try_start(self, fixes: tuple[Fix, ...]) -> None:
+        """Where the first fix by ranges that others state is far from a stated start, let the two contest."""
+        for who in np.flatnonzero(self._given & self.belief.placed).tolist():
+            if not self._corrected or self.free_running or fixes[who].status != "ok":
+                continue
+            self._given[who] = False
+            self._rival = self._rival or beside(self.belief, who, fixes[who], self._arms[who])
+            self._undecided[who] = self._rival is not None and self._rival.vehicle == who
+
     def _clock(self, epoch: RangeEpoch, fixes: tuple[Fix, ...]) -> None:
         """Open the clock offset anew where nothing ties it to the last epoch's: a free-running source, or a start."""
         belief = self.belief
@@ -255,6 +288,34 @@ class Follower:
             bank.take(before, self.belief, epoch, links, asked)
             rough[who] = bank.factors
         self.belief = replace(self.belief, rough=rough)
+
+    def _heed(self, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]) -> None:
+        """Hear a vehicle's own sensors only as long as ranges that others state are not far likelier without them."""
+        inputs, trust, now_s = self.belief.inputs, self.belief.trust, self.belief.time_s
+        if inputs is None or trust is None or not len(inputs.time_s) or len(self.belief.placed) != 1:
+            return
+        if self.free_running or not self.belief.placed[0] or not len(epoch):
+            return
+        if not self.belief.heeded:
+            if self._silence.over(now_s):
+                self._alone = unled(self.belief, bool(turning(self.site)[0]))
+                self.belief = replace(self.belief, heeded=True)
+            return
+        if self._alone is not None:
+            self._alone = self._alone.take(now_s, self.motion, epoch, links, asked, trust.told)
+        if self._alone is not None and self._alone.lost:
+            self._alone = unled(self.belief, bool(turning(self.site)[0]))
+        elif self._alone is None:
+            self._alone = apart(self.belief, self._gathered(self.site.vehicles[0].id), self._arms[0])
+        elif self._alone.won:
+            self.belief = follows(self.belief, self._alone.belief)
+            self._alone, self._rival, self._refused[0], self._undecided[0] = None, None, 0, False
+            silent_s = self._silence.begin(now_s)
+            x, y, z = estimate(self.belief, self.site, 0, "fused").position_m
+            text = (
+                f"ranges gainsay its own sensors, unheard for {silent_s:g} s: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"
+            )
+            events.append(Event(now_s, self.site.vehicles[0].id, "reset", text))
 
     def _weigh(
         self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]
@@ -359,7 +420,8 @@ class Follower:
                 continue
             start = found
             again = lost and self._corrected
-            if (found.status == "too-few" or again) and np.any(self._touches(links, who)):
+            poor = found.status in ("too-few", "ambiguous") and not self.free_running
+            if (poor or again) and np.any(self._touches(links, who)):
                 start = self._gathered(found.vehicle)
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue

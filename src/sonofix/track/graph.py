@@ -241,6 +241,9 @@ class Problem:
         node, inputs = self.nodes[k], self._passage.follower.belief.inputs
         if inputs is None:
             return
+        if not node.belief.heeded:
+            self._begun.clear()  # sensors that ranges gainsay are not heard
+            return
         for row in node.mark.rows:
             kind, who = int(inputs.kind[row]), int(inputs.vehicle[row])
             first, second, third, fourth = inputs.value[row].tolist()
@@ -253,7 +256,7 @@ class Problem:
                 if begun is not None and np.isfinite(first) and np.isfinite(second):
                     self._chord(k, begun, who, first, second)
                 continue
-            if begun is not None and np.all(np.isfinite([first, second, third])) and third <= wheels.LONGEST_S:
+            if begun is not None and np.all(np.isfinite([first, second, third])) and 0.0 < third <= wheels.LONGEST_S:
                 self._arc(k, begun, who, (first, second, third))
             if fourth > 0:
                 # what turns unseen does so after this knot: no arc begins here

@@ -57,10 +57,10 @@ def take(
 ) -> None:
     """Correct a belief by a turn that took ``dt``, in place, and put the anchor at its end.
 
-    Without a heading to turn, or with an empty cell or a gap, it tells nothing.
+    Without a heading to turn, without time, or with an empty cell or a gap, it tells nothing.
     """
     at = SIZE * vehicle + YAW
-    if free[slot] and free[at] and np.isfinite(turn_rad) and dt <= LONGEST_S:
+    if free[slot] and free[at] and np.isfinite(turn_rad) and 0.0 < dt <= LONGEST_S:
         derivative = np.zeros((1, len(mean)))
         derivative[0, at], derivative[0, slot], derivative[0, slot + 1] = 1.0, -1.0, dt
         miss = np.array([turn_rad - mean[slot + 1] * dt - (mean[at] - mean[slot])])

@@ -55,6 +55,9 @@ TAILED = 3.0
 UNDONE = 20.0
 """Those odds grow no larger, either way: noise may change."""
 
+STRAY = log(0.05 / 100.0)
+"""Logarithm of the density (1/m) of a range that may be anything within 100 m; one in twenty is."""
+
 REMEMBERED = 100.0
 """Ranges of a pair by which its noise is judged; of all pairs ten times as many."""
 
@@ -99,7 +102,8 @@ class Trust:
     jumps : int
         How often a pair's error has jumped.
     told : float
-        Logarithm of the likelihood of the epoch just taken in.
+        Logarithm of the likelihood of the epoch just taken in, with no range below `STRAY`: how wide a belief is, is no
+        reason to be told by outliers.
     tailed : float
         Logarithm of the odds that noise has the heavier tails.
     sizes : float64 (4,) or None
@@ -172,7 +176,8 @@ class Trust:
         tells = (noise / spread) ** 2
         larger = 1.0 / (self.tails @ (1.0 / heavier(miss**2 / spread, freedom)))
         tailed = float(np.clip(self.tailed + (told[0] - told[1]) @ tells, -UNDONE, UNDONE))
-        return replace(self, told=float(np.sum(self.tails @ told)), tailed=tailed), larger
+        each = self.tails @ told
+        return replace(self, told=float(np.sum(np.maximum(each, STRAY))), tailed=tailed), larger
 
     def heard(
         self, pair: NDArray[np.int64], miss: Floats, spread: Floats, time_s: Floats
@@ -325,7 +330,7 @@ def heavier(surprise: Floats, freedom: Floats | float) -> Floats:
 
 
 def log_likelihood(surprise: Floats, variance: Floats) -> Floats:
-    """Logarithms (2, n) of rows' Student's t density, of each of `FREEDOM`, but for a constant.
+    """Logarithms (2, n) of rows' Student's t density (1/m), of each of `FREEDOM`.
 
     ``surprise`` and ``variance`` (2, n).
     """

@@ -92,11 +92,12 @@ def take(
     """Correct a belief at the end of an arc, in place, and put the anchor there.
 
     ``arc`` is way, turn, time, and what it may have turned unseen at their end; ``arm`` (2,) is where the motion is
-    followed, from the vehicle's origin. The arc is linearised at ``about``, or else at the mean.
+    followed, from the vehicle's origin. The arc is linearised at ``about``, or else at the mean. One that took no time
+    (a row that stands there twice) tells nothing.
     """
     at = SIZE * vehicle
     way, turn, dt, unseen = arc
-    if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and dt <= LONGEST_S:
+    if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and 0.0 < dt <= LONGEST_S:
         if about is None:
             # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
             way *= float(np.exp(-covariance[slot + 2, slot + 2] / 2))
