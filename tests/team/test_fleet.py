@@ -71,6 +71,27 @@ def test_a_push_is_found():
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.12
 
 
+@pytest.mark.parametrize("robot", [0, 2])
+@pytest.mark.parametrize(("by_m", "takes_s"), [(0.8, 0.1), (1.5, 0.8), (-3.0, 0.6)])
+def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(robot, by_m, takes_s):
+    recording, truth = fleet(seconds=30, seed=8, pushed=(robot, 20.1, by_m), push_takes_s=takes_s)
+    moments, _ = run(recording)
+    events = [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15]
+    assert events == [("slip", f"R{robot}")]
+    assert nees(*errors(moments, truth, after_s=22.5)) < 4.0
+
+
+def test_until_a_pushed_robot_is_found_its_place_is_open():
+    recording, truth = fleet(seconds=30, seed=8, pushed=(1, 20.1, 1.0), push_takes_s=0.8)
+    moments, _ = run(recording)
+    slip_s = next(e.time_s for m in moments for e in m.events if e.event == "slip")
+    between = [m for m in moments if 20.35 < m.time_s < slip_s]
+    assert between
+    for moment in between:
+        off = moment.pose[1, :2] - [np.interp(moment.time_s, truth["R1"][:, 0], truth["R1"][:, i]) for i in (1, 2)]
+        assert off @ np.linalg.solve(moment.covariance[1, :2, :2], off) < 9.0
+
+
 def test_a_robot_that_falls_silent_leaves_and_joins_again():
     recording, _ = fleet(seconds=60, seed=5, silent={2: (20.0, 40.0)})
     moments, _ = run(recording)

@@ -70,7 +70,7 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     begin, end = from_s - lag, until_s - lag
     n = len(time_s)
     i = np.searchsorted(time_s, begin, side="right") - 1
-    first_v = first_w = last_v = 0.0
+    first_v = first_w = last_v = last_w = 0.0
     turn_sum = span = 0.0
     x_turn = y_turn = x_drift = y_drift = 0.0
     place = heading = 0.0
@@ -97,8 +97,13 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
         rate = 0.0 if silent else (1.0 - slip) * w - own[DRIFT]
         speed = rest * v
         if start:
+            # where a row begins just here, the drive before ended with what was told until then, and so begins this one
             first_v, first_w, start = speed, rate, False
-        last_v = speed
+            if i >= 0 and time_s[i] == begin:
+                first_v = first_w = 0.0
+                if i > 0 and begin <= time_s[i - 1] + LONGEST_S and np.isfinite(told[i - 1, 0] + told[i - 1, 1]):
+                    first_v, first_w = rest * told[i - 1, 0], (1.0 - slip) * told[i - 1, 1] - own[DRIFT]
+        last_v, last_w = speed, rate
         turned = rate * dt
         half = 0.5 * turned
         bent = 1.0 - half * half / 6.0 if abs(half) < 1e-3 else np.sin(half) / half
@@ -136,15 +141,11 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     by[0, TURN], by[1, TURN], by[2, TURN] = x_turn, y_turn, -turn_sum
     by[0, TURN_SLIP], by[1, TURN_SLIP], by[2, TURN_SLIP] = x_turn, y_turn, -turn_sum
     by[0, DRIFT], by[1, DRIFT], by[2, DRIFT] = x_drift, y_drift, -span
-    # later by lag: a piece more at the start, which turns the rest, and one less at the end, of what is told from there
-    # on: where one drive ends and the next begins both must take the same, or a start between them tells no lag
-    next_v = next_w = 0.0
-    if not start and i >= 0 and end < time_s[i] + LONGEST_S and np.isfinite(told[i, 0]) and np.isfinite(told[i, 1]):
-        next_v, next_w = rest * told[i, 0], (1.0 - slip) * told[i, 1] - own[DRIFT]
+    # later by lag: a piece more at the start, of what was told until then, which turns the rest; one less at the end
     c0, s0 = np.cos(own[YAW]), np.sin(own[YAW])
-    by[0, LAG] = first_v * c0 - first_w * dy - next_v * np.cos(yaw)
-    by[1, LAG] = first_v * s0 + first_w * dx - next_v * np.sin(yaw)
-    by[2, LAG] = first_w - next_w
+    by[0, LAG] = first_v * c0 - first_w * dy - last_v * np.cos(yaw)
+    by[1, LAG] = first_v * s0 + first_w * dx - last_v * np.sin(yaw)
+    by[2, LAG] = first_w - last_w
     stray[0], stray[1] = place, heading
     return last_v
 

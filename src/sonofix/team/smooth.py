@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from sonofix.records import Floats
 from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import SLIPPED, Belief, Moment
+from sonofix.team.fleet import Belief, Moment
 from sonofix.team.hear import REFUSED, age, spread
 from sonofix.team.kernel import STRAYS, advance, drive, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
+from sonofix.team.pushed import SLIPPED
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior_sd, wander_psd
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
