@@ -332,9 +332,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         yield moment, belief
 
 
-def _leave(
-    belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, events: list[Event]
-) -> None:
+def _leave(belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, events: list[Event]) -> None:
     """Take away robots of which nothing came for long."""
     for robot in np.flatnonzero(belief.placed).tolist():
         if time_s - recent.told_s(robot, time_s) > LEFT_S:
