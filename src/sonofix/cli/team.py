@@ -184,16 +184,20 @@ def _check(recording: Recording, landmarks_of: list[str] | None) -> None:
 
 
 def _feed(recording: Recording, bar: Progress) -> Feed:
-    """Gather what a recording states, or what the receiver makes of its samples."""
+    """Gather what the receiver makes of a recording's samples, or what it states: ranges, or else exchanges."""
     from sonofix import flow
     from sonofix.team.feed import gather
     from sonofix.team.tell import ranges_of
+    from sonofix.two_way import exchange_epochs
 
-    if recording.ranges is not None or recording.blocks is None:
+    if recording.blocks is not None:
+        task = bar.add_task("listening", total=recording.sample_count)
+        heard = flow.run(watched(recording, lambda count: bar.advance(task, count)))
+        return gather(recording, ranges_of(step.ranges for step in heard), own_ranges=True)
+    if recording.ranges is not None or "exchanges" not in recording.tables:
         return gather(recording)
-    task = bar.add_task("listening", total=recording.sample_count)
-    heard = list(flow.run(watched(recording, lambda count: bar.advance(task, count))))
-    return gather(recording, ranges_of(heard), own_ranges=True)
+    epochs = list(exchange_epochs(recording.tables["exchanges"], recording.site))
+    return gather(recording, ranges_of(epochs), own_ranges=all(epoch.sd_stated for epoch in epochs))
 
 
 def _told(feed: Feed, belief, apart) -> list[str]:
