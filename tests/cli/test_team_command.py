@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from sonofix.cli.main import app
 from team.made_fleet import fleet
 
-
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad")
 
 

@@ -230,7 +230,11 @@ def _summarise(folder: Path, out: Path, feed: Feed, moments: list[Moment], score
         table["sd of position (x, y), median"].append(length_text(float(np.median(sd))) if sd else "")
     span = moments[-1].time_s - moments[0].time_s if moments else 0.0
     kind = "smoothed" if smoothed else "causal"
+    never = [name for name, told in zip(feed.robots, table["first placed"], strict=True) if told == "never"]
     print_table(f"{counted(len(feed.robots), 'robot')} over {span:.0f} s, {kind}", feed.robots, table)
+    if never:
+        remedy = "state start poses (start.csv), or let them hear landmarks or robots that are placed"
+        speaker().print(f"Never placed: {', '.join(never)}; {remedy}")
     if scored:
         from sonofix.cli.score import score_run, track_rows
 

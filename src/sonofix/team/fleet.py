@@ -36,6 +36,9 @@ LEFT_S = 10.0
 JUDGED = 6
 """Latest measurements by which it is judged whether a robot is where its track has it."""
 
+AT_ODDS = 8
+"""Ranges of two robots, refused one after the other while the rest agrees, that show that one of them is elsewhere."""
+
 WAITED_S = 2.0
 """One that was pushed and is not found by then is lost."""
 
@@ -224,11 +227,13 @@ class Watch:
     def __init__(self, robots: int) -> None:
         self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
         self._first: dict[int, int] = {}
+        self._odds: dict[tuple[int, int], list[float]] = {}
 
     def clear(self, robot: int) -> None:
         """Forget what was refused of a robot, by others too: they are not to blame."""
         self._latest[robot].clear()
         self._first.clear()
+        self._odds = {pair: misses for pair, misses in self._odds.items() if robot not in pair}
         for latest in self._latest:
             kept = [one for one in latest if one[1] != robot]
             latest.clear()
@@ -246,6 +251,11 @@ class Watch:
                     # fixed ends are told apart by their pair
                     partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
                     self._latest[robot].append((i, partner, bool(np.all(used[k][asked]))))
+            if min(ends) >= 0 and asked[0]:
+                misses = self._odds.setdefault((min(ends), max(ends)), [])
+                misses.append(abs(float(told[k, 0, 0])))
+                if used[k, 0]:
+                    misses.clear()
 
     def astray(self) -> tuple[int, list[int]] | None:
         """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
@@ -266,6 +276,11 @@ class Watch:
             if worst is None or share > worst[0]:
                 worst = share, robot, sorted({first, *refused.values()})
         return None if worst is None else worst[1:]
+
+    def at_odds(self) -> dict[tuple[int, int], float]:
+        """Return pairs of robots whose ranges are refused again and again, and by how much (m) these are off."""
+        found = {pair: misses[-AT_ODDS:] for pair, misses in self._odds.items() if len(misses) >= AT_ODDS}
+        return {pair: float(np.median(misses)) for pair, misses in found.items()}
 
 
 def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Belief]]:
@@ -289,14 +304,15 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     past: deque[Before] = deque()
     now: float | None = None
     asked_s = left_s = -np.inf
-    for time_s, first, last in instants(feed):
+    steps, told_of = instants(feed), set()
+    for time_s, first, last in steps:
         events: list[Event] = []
         rows = (first, last)
         belief.drive(feed, time_s if now is None else now, time_s)
         now = time_s
         if time_s - left_s >= ASK_S:
             left_s = time_s
-            _leave(belief, feed, watch, recent, time_s, events)
+            _leave(belief, feed, watch, recent, time_s, time_s - steps[0][0], events)
         frozen = until_placed and belief.placed.all()
         count = last - first
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
@@ -324,7 +340,15 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
                 _place(belief, feed, recent, time_s, events)
         if any(event.event in ("joined", "left", "lost") for event in events):
             past.clear()  # it was before that
+        odds = watch.at_odds()
+        events += [
+            event for pair, miss_m in odds.items() if pair not in told_of for event in _odd(feed, pair, miss_m, now)
+        ]
+        told_of = set(odds)
         moment = belief.moment(time_s, rows, used, events)
+        for pair, miss_m in odds.items():
+            # nothing tells which of them it is, nor by what it was turned round the others
+            moment.covariance[list(pair), :2, :2] += (2.0 * miss_m) ** 2 * np.eye(2)
         found = watch.astray()
         if found is not None:
             # moved aside, and nobody knows yet where to
@@ -332,10 +356,12 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         yield moment, belief
 
 
-def _leave(belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, events: list[Event]) -> None:
-    """Take away robots of which nothing came for long."""
+def _leave(
+    belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, since_s: float, events: list[Event]
+) -> None:
+    """Take away robots of which nothing came for long; ``since_s``: how long ago all began."""
     for robot in np.flatnonzero(belief.placed).tolist():
-        if time_s - recent.told_s(robot, time_s) > LEFT_S:
+        if min(time_s - recent.told_s(robot, time_s), since_s) > LEFT_S:
             belief.lift(robot)
             watch.clear(robot)
             recent.forget(robot)
@@ -352,6 +378,15 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
             x, y, yaw = found.pose
             text = f"placed at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
             events.append(Event(time_s, feed.robots[robot], "joined", text))
+
+
+def _odd(feed: Feed, pair: tuple[int, int], miss_m: float, time_s: float) -> list[Event]:
+    text = "its ranges with {} are off by {:.2f} m, while all else agrees: one of them is elsewhere"
+    names = [feed.robots[robot] for robot in pair]
+    return [
+        Event(time_s, name, "excluded", text.format(other, miss_m))
+        for name, other in zip(names, names[::-1], strict=True)
+    ]
 
 
 def _reopen(
