@@ -138,6 +138,21 @@ def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
     assert not [e for m in moments for e in m.events]
 
 
+def test_smoothing_keeps_what_start_poses_tell():
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = standing(starts, starts)
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
+    for moment in smooth(feed, moments, belief, np.array(means)):
+        for r in range(3):
+            # no surer than three such starts make it, and hardly less than one does
+            assert 0.02 < np.sqrt(moment.covariance[r, 0, 0]) < 0.06
+            assert np.hypot(*(moment.pose[r, :2] - starts[r][:2])) < 0.02
+
+
 def test_a_robot_without_odometry_has_not_left_before_it_could_be_heard():
     starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
     feed = standing(starts, starts)
