@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from typer.testing import CliRunner
 
 from sonofix.cli.main import app
 from team.made_fleet import fleet
+
+COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +75,54 @@ def test_an_animation_is_drawn(folder, tmp_path):
     assert done.exit_code == 0, done.stderr
     assert (tmp_path / "team.gif").read_bytes().startswith(b"GIF8")
     assert not (tmp_path / "out" / "team.png").exists()
+
+
+def test_exchanges_of_robots_on_clocks_of_their_own_place_them(folder, tmp_path):
+    place = tmp_path / "exchanged"
+    place.mkdir()
+    for name in ("site.toml", "odometry.csv", "truth.csv"):
+        shutil.copy(folder / name, place)
+    with (folder / "truth.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    paths = {
+        name: np.array(
+            [[float(r[c]) for c in ("time_s", "x_m", "y_m", "yaw_rad")] for r in rows if r["vehicle"] == name]
+        )
+        for name in ("R0", "R1", "R2")
+    }
+    rng = np.random.default_rng(3)
+
+    def shows(name, time_s):
+        ahead_s, fast = {"R0": (0.0, 0.0), "R1": (0.3, 1e-4), "R2": (-1.7, -1e-4)}[name]
+        return (1 + fast) * time_s + ahead_s
+
+    def at(name, time_s):
+        return np.array([np.interp(time_s, paths[name][:, 0], paths[name][:, i]) for i in (1, 2)])
+
+    def heard(source, listener, sent_s):
+        # at 0.4 m/s the way changes by a millimetre while the sound is under way: two rounds are enough
+        time_s = sent_s
+        for _ in range(3):
+            time_s = sent_s + np.hypot(*(at(listener, time_s) - at(source, sent_s))) / 343.2
+        return time_s + rng.normal(0, 2e-6)
+
+    lines = ["from,to,sent_s,heard_s,reply_sent_s,reply_heard_s"]
+    for sent_s in np.arange(0.1, 11.5, 0.5):
+        for a, b in (("R0", "R1"), ("R0", "R2"), ("R1", "R2")):
+            back_s = sent_s + 0.16
+            stamps = (shows(a, sent_s), shows(b, heard(a, b, sent_s)), shows(b, back_s), shows(a, heard(b, a, back_s)))
+            lines.append(",".join([a, b, *(f"{stamp:.9f}" for stamp in stamps)]))
+    (place / "exchanges.csv").write_text("\n".join(lines), "utf-8")
+    starts = [f"{name},{path[0, 1]},{path[0, 2]},{path[0, 3]}" for name, path in paths.items()]
+    (place / "start.csv").write_text("\n".join(["vehicle,x_m,y_m,yaw_rad", *starts]), "utf-8")
+    done = run("team", place, "-o", tmp_path / "out", "--no-plot")
+    assert done.exit_code == 0, done.stderr
+    scored = json.loads(run("score", place, tmp_path / "out", "--json").stdout)
+    # offsets left in would be 100 m and more
+    assert scored["ranges"]["used"]["rms_m"] < 0.06
+    assert set(scored["track"]) == set(paths)
+    # nothing but the start says where all of them together are
+    assert max(track["rmse_xy_m"] for track in scored["track"].values()) < 0.3
 
 
 @pytest.mark.parametrize(

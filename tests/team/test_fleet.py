@@ -1,6 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sonofix.records import RangeRows, Recording, Table
+from sonofix.site import Site
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
 from sonofix.team.fleet import follow
@@ -69,6 +73,95 @@ def test_a_push_is_found():
     assert 25.0 <= events[0].time_s < 27.0
     error, _ = errors(moments, truth, after_s=30)
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.12
+
+
+@pytest.mark.parametrize("robot", [0, 2])
+@pytest.mark.parametrize(("by_m", "takes_s"), [(0.8, 0.1), (1.5, 0.8), (-3.0, 0.6)])
+def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(robot, by_m, takes_s):
+    recording, truth = fleet(seconds=30, seed=8, pushed=(robot, 20.1, by_m), push_takes_s=takes_s)
+    moments, _ = run(recording)
+    events = [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15]
+    assert events == [("slip", f"R{robot}")]
+    assert nees(*errors(moments, truth, after_s=22.5)) < 4.0
+
+
+def test_until_a_pushed_robot_is_found_its_place_is_open():
+    recording, truth = fleet(seconds=30, seed=8, pushed=(1, 20.1, 1.0), push_takes_s=0.8)
+    moments, _ = run(recording)
+    slip_s = next(e.time_s for m in moments for e in m.events if e.event == "slip")
+    between = [m for m in moments if 20.35 < m.time_s < slip_s]
+    assert between
+    for moment in between:
+        off = moment.pose[1, :2] - [np.interp(moment.time_s, truth["R1"][:, 0], truth["R1"][:, i]) for i in (1, 2)]
+        assert off @ np.linalg.solve(moment.covariance[1, :2, :2], off) < 9.0
+
+
+def standing(starts, told):
+    """Return a recording of three robots that stand for 10 s, and hear each other to a millimetre twice a second."""
+    names = ("R0", "R1", "R2")
+    rng, rows = np.random.default_rng(1), []
+    for time_s in np.arange(0.1, 10.0, 0.5):
+        for a, b in ((0, 1), (0, 2), (1, 2)):
+            for source, listener in ((a, b), (b, a)):
+                far = np.hypot(*np.subtract(starts[a][:2], starts[b][:2])) + rng.normal(0, 1e-3)
+                rows.append((time_s + 0.1 * source, names[source], names[listener], far))
+    rows.sort()
+    time_s, emitter, receiver, range_m = zip(*rows, strict=True)
+    nodes = [{"id": name, "vehicle": name, "lever_arm_m": [0, 0, 0]} for name in names]
+    vehicles = [{"id": name, "z_m": 0.0} for name in names]
+    odometry_s = np.repeat(np.arange(0.0, 10.0, 0.5), 3)
+    still = np.zeros(len(odometry_s))
+    tables = {
+        "odometry": Table(
+            {"time_s": odometry_s, "v_mps": still, "yaw_rate_radps": still}, {"vehicle": names * (len(still) // 3)}
+        ),
+        "start": Table(dict(zip(("x_m", "y_m", "yaw_rad"), np.array(told, float).T, strict=True)), {"vehicle": names}),
+    }
+    site = Site.model_validate({"format": 1, "vehicle": vehicles, "beacon": nodes, "microphone": nodes})
+    sd = np.full(len(rows), 1e-3)
+    ranges = RangeRows(np.array(time_s), emitter, receiver, np.array(range_m), sd)
+    return gather(Recording(site, ranges=ranges, tables=tables), own_ranges=True)
+
+
+@pytest.mark.parametrize("turn_rad", [0.15, -0.25, 0.5, -0.9])
+def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    # as far from the first as it is, so that only its ranges with the second are wrong
+    cos, sin = np.cos(turn_rad), np.sin(turn_rad)
+    moments = [m for m, _ in follow(standing(starts, [*starts[:2], (cos - 3 * sin, sin + 3 * cos, 0.0)]))]
+    events = [(e.event, e.vehicle) for m in moments for e in m.events]
+    assert events == [("excluded", "R1"), ("excluded", "R2")]
+    for r in range(3):
+        off = moments[-1].pose[r, :2] - starts[r][:2]
+        assert off @ np.linalg.solve(moments[-1].covariance[r, :2, :2], off) < 9.0
+    moments = [m for m, _ in follow(standing(starts, starts))]
+    assert not [e for m in moments for e in m.events]
+
+
+def test_smoothing_keeps_what_start_poses_tell():
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = standing(starts, starts)
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
+    for moment in smooth(feed, moments, belief, np.array(means)):
+        for r in range(3):
+            # no surer than three such starts make it, and hardly less than one does
+            assert 0.02 < np.sqrt(moment.covariance[r, 0, 0]) < 0.06
+            assert np.hypot(*(moment.pose[r, :2] - starts[r][:2])) < 0.02
+
+
+def test_a_robot_without_odometry_has_not_left_before_it_could_be_heard():
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = standing(starts, starts)
+    first = np.array([*feed.first[:3], feed.first[2]])
+    mute = replace(feed, first=first, odometry_s=feed.odometry_s[: first[2]], odometry=feed.odometry[: first[2]])
+    moments = [m for m, _ in follow(mute)]
+    assert not [e for m in moments for e in m.events]
+    off = moments[-1].pose[2, :2] - starts[2][:2]
+    assert off @ np.linalg.solve(moments[-1].covariance[2, :2, :2], off) < 25.0
 
 
 def test_a_robot_that_falls_silent_leaves_and_joins_again():

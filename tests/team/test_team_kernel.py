@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -105,3 +107,15 @@ def test_a_turn_unseen_opens_the_heading_once():
     # it happens where that row begins, in whichever piece that is
     np.testing.assert_allclose(sum(more), 0.04, atol=1e-12)
     assert max(more) == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("edges", [(0.2, 0.4, 0.9, 1.1), (0.2, 0.3, 1.0, 1.1), (0.2, 0.6, 0.6, 1.1)])
+def test_drives_in_a_row_know_of_the_lag_what_one_does(edges):
+    own = np.array([0.0, 0.0, 0.3, *np.zeros(SIZE - 3)])
+    whole = driven(own, edges[0], edges[-1])[1][:, LAG]
+    chained = np.zeros(POSE)
+    # wherever they are cut: at 0.4 and 0.9 rows begin, and what is told changes just where one drive ends
+    for from_s, until_s in pairwise(edges):
+        own[:POSE], by, _ = driven(own, from_s, until_s)
+        chained = by[:, :POSE] @ chained + by[:, LAG]
+    np.testing.assert_allclose(chained, whole, atol=1e-12)

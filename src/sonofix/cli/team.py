@@ -184,16 +184,20 @@ def _check(recording: Recording, landmarks_of: list[str] | None) -> None:
 
 
 def _feed(recording: Recording, bar: Progress) -> Feed:
-    """Gather what a recording states, or what the receiver makes of its samples."""
+    """Gather what the receiver makes of a recording's samples, or what it states: ranges, or else exchanges."""
     from sonofix import flow
     from sonofix.team.feed import gather
     from sonofix.team.tell import ranges_of
+    from sonofix.two_way import exchange_epochs
 
-    if recording.ranges is not None or recording.blocks is None:
+    if recording.blocks is not None:
+        task = bar.add_task("listening", total=recording.sample_count)
+        heard = flow.run(watched(recording, lambda count: bar.advance(task, count)))
+        return gather(recording, ranges_of(step.ranges for step in heard), own_ranges=True)
+    if recording.ranges is not None or "exchanges" not in recording.tables:
         return gather(recording)
-    task = bar.add_task("listening", total=recording.sample_count)
-    heard = list(flow.run(watched(recording, lambda count: bar.advance(task, count))))
-    return gather(recording, ranges_of(heard), own_ranges=True)
+    epochs = list(exchange_epochs(recording.tables["exchanges"], recording.site))
+    return gather(recording, ranges_of(epochs), own_ranges=all(epoch.sd_stated for epoch in epochs))
 
 
 def _told(feed: Feed, belief, apart) -> list[str]:
@@ -226,7 +230,11 @@ def _summarise(folder: Path, out: Path, feed: Feed, moments: list[Moment], score
         table["sd of position (x, y), median"].append(length_text(float(np.median(sd))) if sd else "")
     span = moments[-1].time_s - moments[0].time_s if moments else 0.0
     kind = "smoothed" if smoothed else "causal"
+    never = [name for name, told in zip(feed.robots, table["first placed"], strict=True) if told == "never"]
     print_table(f"{counted(len(feed.robots), 'robot')} over {span:.0f} s, {kind}", feed.robots, table)
+    if never:
+        remedy = "state start poses (start.csv), or let them hear landmarks or robots that are placed"
+        speaker().print(f"Never placed: {', '.join(never)}; {remedy}")
     if scored:
         from sonofix.cli.score import score_run, track_rows
 

@@ -16,6 +16,7 @@ from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
+from sonofix.team.pushed import SLIPPED, Before, search
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
@@ -35,16 +36,14 @@ LEFT_S = 10.0
 JUDGED = 6
 """Latest measurements by which it is judged whether a robot is where its track has it."""
 
-SLIPPED = (1.0, 1.0, 0.5)
-"""How far aside a robot may be found that was pushed, in m and rad."""
+AT_ODDS = 8
+"""Ranges of two robots, refused one after the other while the rest agrees, that show that one of them is elsewhere."""
 
-ITERATED = 8
+WAITED_S = 2.0
+"""One that was pushed and is not found by then is lost."""
 
-EXPLAINED = 0.7
-"""Share of what was heard since that a slip must explain."""
-
-REWOUND_S = 2.0
-"""A slip is looked for so far back."""
+REWOUND_S = 4.0
+"""A push is looked for so far back."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,10 +226,14 @@ class Watch:
 
     def __init__(self, robots: int) -> None:
         self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
+        self._first: dict[int, int] = {}
+        self._odds: dict[tuple[int, int], list[float]] = {}
 
     def clear(self, robot: int) -> None:
         """Forget what was refused of a robot, by others too: they are not to blame."""
         self._latest[robot].clear()
+        self._first.clear()
+        self._odds = {pair: misses for pair, misses in self._odds.items() if robot not in pair}
         for latest in self._latest:
             kept = [one for one in latest if one[1] != robot]
             latest.clear()
@@ -248,21 +251,36 @@ class Watch:
                     # fixed ends are told apart by their pair
                     partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
                     self._latest[robot].append((i, partner, bool(np.all(used[k][asked]))))
+            if min(ends) >= 0 and asked[0]:
+                misses = self._odds.setdefault((min(ends), max(ends)), [])
+                misses.append(abs(float(told[k, 0, 0])))
+                if used[k, 0]:
+                    misses.clear()
 
     def astray(self) -> tuple[int, list[int]] | None:
         """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
 
-        These are the latest of each partner; None: there is no such robot, or too little to find it by.
+        These are the first of each partner; None: there is no such robot, or too little to find it by.
         """
         worst: tuple[float, int, list[int]] | None = None
         for robot, latest in enumerate(self._latest):
-            if len(latest) < 4:
+            refused: dict[int, int] = {}
+            for row, partner, ok in latest:
+                if not ok:
+                    refused.setdefault(partner, row)
+            share = sum(not ok for _, _, ok in latest) / max(len(latest), 4)
+            if len(refused) < 2 or share < 0.6:
+                self._first.pop(robot, None)
                 continue
-            refused = {partner: row for row, partner, ok in latest if not ok}
-            share = sum(not ok for _, _, ok in latest) / len(latest)
-            if len(refused) >= 2 and share >= 0.6 and (worst is None or share > worst[0]):
-                worst = share, robot, sorted(refused.values())
+            first = self._first.setdefault(robot, min(refused.values()))
+            if worst is None or share > worst[0]:
+                worst = share, robot, sorted({first, *refused.values()})
         return None if worst is None else worst[1:]
+
+    def at_odds(self) -> dict[tuple[int, int], float]:
+        """Return pairs of robots whose ranges are refused again and again, and by how much (m) these are off."""
+        found = {pair: misses[-AT_ODDS:] for pair, misses in self._odds.items() if len(misses) >= AT_ODDS}
+        return {pair: float(np.median(misses)) for pair, misses in found.items()}
 
 
 def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Belief]]:
@@ -283,22 +301,23 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     for robot, start in feed.starts.items():
         belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
     rough = Rough(feed)
-    past: deque[_Before] = deque()
+    past: deque[Before] = deque()
     now: float | None = None
     asked_s = left_s = -np.inf
-    for time_s, first, last in instants(feed):
+    steps, told_of = instants(feed), set()
+    for time_s, first, last in steps:
         events: list[Event] = []
         rows = (first, last)
         belief.drive(feed, time_s if now is None else now, time_s)
         now = time_s
         if time_s - left_s >= ASK_S:
             left_s = time_s
-            _leave(belief, feed, recent, time_s, events)
+            _leave(belief, feed, watch, recent, time_s, time_s - steps[0][0], events)
         frozen = until_placed and belief.placed.all()
         count = last - first
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
         if count and not until_placed:
-            past.append(_Before(time_s, rows, belief.mean.copy(), belief.covariance.copy(), belief.last.copy()))
+            past.append(Before(time_s, rows, belief.mean.copy(), belief.covariance.copy(), belief.last.copy()))
             while time_s - past[0].time_s > REWOUND_S:
                 past.popleft()
             ends = {int(end) for i in range(*rows) for end in (feed.listener[i], feed.source[i])} - {-1}
@@ -309,23 +328,42 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
                 rough.slipped(belief, robot, time_s)
             watch.see(feed, rows, used, told)
             found = watch.astray()
-            if found is not None:
-                _reopen(belief, feed, found, watch, recent, past, events)
-                rough.forget(found[0])
+            if found is not None and (feed.kind[first:last] == SIGHTING).any():
+                robot, refused = found
+                if _reopen(belief, feed, robot, refused[0], watch, recent, past, events):
+                    rough.forget(robot)
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
             if not belief.placed.all() and time_s - asked_s >= ASK_S:
                 asked_s = time_s
                 _place(belief, feed, recent, time_s, events)
-        yield belief.moment(time_s, rows, used, events), belief
+        if any(event.event in ("joined", "left", "lost") for event in events):
+            past.clear()  # it was before that
+        odds = watch.at_odds()
+        events += [
+            event for pair, miss_m in odds.items() if pair not in told_of for event in _odd(feed, pair, miss_m, now)
+        ]
+        told_of = set(odds)
+        moment = belief.moment(time_s, rows, used, events)
+        for pair, miss_m in odds.items():
+            # nothing tells which of them it is, nor by what it was turned round the others
+            moment.covariance[list(pair), :2, :2] += (2.0 * miss_m) ** 2 * np.eye(2)
+        found = watch.astray()
+        if found is not None:
+            # moved aside, and nobody knows yet where to
+            moment.covariance[found[0]] += np.diag(np.square(SLIPPED))
+        yield moment, belief
 
 
-def _leave(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: list[Event]) -> None:
-    """Take away robots of which nothing came for long."""
+def _leave(
+    belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, since_s: float, events: list[Event]
+) -> None:
+    """Take away robots of which nothing came for long; ``since_s``: how long ago all began."""
     for robot in np.flatnonzero(belief.placed).tolist():
-        if time_s - recent.told_s(robot, time_s) > LEFT_S:
+        if min(time_s - recent.told_s(robot, time_s), since_s) > LEFT_S:
             belief.lift(robot)
+            watch.clear(robot)
             recent.forget(robot)
             events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
 
@@ -342,62 +380,39 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
             events.append(Event(time_s, feed.robots[robot], "joined", text))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Before:
-    """A belief as it was before what was heard at an instant."""
-
-    time_s: float
-    rows: tuple[int, int]
-    mean: Floats
-    covariance: Floats
-    last: Floats
+def _odd(feed: Feed, pair: tuple[int, int], miss_m: float, time_s: float) -> list[Event]:
+    text = "its ranges with {} are off by {:.2f} m, while all else agrees: one of them is elsewhere"
+    names = [feed.robots[robot] for robot in pair]
+    return [
+        Event(time_s, name, "excluded", text.format(other, miss_m))
+        for name, other in zip(names, names[::-1], strict=True)
+    ]
 
 
 def _reopen(
     belief: Belief,
     feed: Feed,
-    found: tuple[int, list[int]],
+    robot: int,
+    first: int,
     watch: Watch,
     recent: Recent,
-    past: Sequence[_Before],
+    past: Sequence[Before],
     events: list[Event],
-) -> None:
-    """Find a robot that is not where its track has it: open its place where that began, and hear anew what came since.
-
-    Far from where it was, a first linearisation is a poor one, so it is done about what it led to, again and again
-    (Bell and Cathey 1993). Where that explains too little, the robot's place is taken away.
-    """
-    robot, rows = found
-    watch.clear(robot)
-    kept, now_s = (belief.mean.copy(), belief.covariance.copy()), past[-1].time_s
-    since = [before for before in past if before.rows[1] > rows[0]]
-    at, shift, taken = belief.at(robot), np.zeros(POSE), 0.0
-    for _ in range(ITERATED):
-        belief.mean[:], belief.covariance[:], belief.last[:] = since[0].mean, since[0].covariance, since[0].last
-        belief.loosen(robot, SLIPPED)
-        track = belief.mean.copy()
-        used: list[bool] = []
-        for i, step in enumerate(since):
-            if i:
-                last_s = since[i - 1].time_s
-                own, shared = belief.mean.copy(), belief.covariance.copy()
-                belief.mean[:] = track
-                belief.drive(feed, last_s, step.time_s)
-                track = belief.mean.copy()
-                belief.mean[:], belief.covariance[:] = own, shared
-                belief.drive(feed, last_s, step.time_s)
-            about = belief.mean.copy()
-            about[at] = track[at] + shift
-            heard, _ = belief.hear(feed, step.rows, about)
-            own_rows = [k for k, row in enumerate(range(*step.rows)) if robot in (feed.listener[row], feed.source[row])]
-            used += [bool(heard[k].any()) for k in own_rows]
-        shift, taken = belief.mean[at] - track[at], float(np.mean(used))
-    apart = float(np.hypot(*(belief.mean[at] - kept[0][at])[:2]))
-    if taken >= EXPLAINED:
+) -> bool:
+    """Find a robot that is not where its track has it, or take its place away; return whether that is decided."""
+    now_s = past[-1].time_s
+    found = search(belief, feed, robot, first, list(past))
+    if found is None:
+        if now_s - feed.time_s[first] < WAITED_S:
+            return False
+        belief.lift(robot)
+        recent.forget(robot)
+        text = "what is heard disagrees with its track: to be placed anew"
+        events.append(Event(now_s, feed.robots[robot], "lost", text))
+    else:
+        belief.mean[:], belief.covariance[:], belief.last[:] = found.mean, found.covariance, found.last
+        apart = float(np.hypot(*found.shift[:2]))
         text = f"what is heard disagrees with its odometry: {apart:.2f} m from where that had it"
         events.append(Event(now_s, feed.robots[robot], "slip", text))
-        return
-    belief.mean[:], belief.covariance[:] = kept
-    belief.lift(robot)
-    recent.forget(robot)
-    events.append(Event(now_s, feed.robots[robot], "lost", "what is heard disagrees with its track: to be placed anew"))
+    watch.clear(robot)
+    return True

@@ -97,7 +97,12 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
         rate = 0.0 if silent else (1.0 - slip) * w - own[DRIFT]
         speed = rest * v
         if start:
+            # where a row begins just here, the drive before ended with what was told until then, and so begins this one
             first_v, first_w, start = speed, rate, False
+            if i >= 0 and time_s[i] == begin:
+                first_v = first_w = 0.0
+                if i > 0 and begin <= time_s[i - 1] + LONGEST_S and np.isfinite(told[i - 1, 0] + told[i - 1, 1]):
+                    first_v, first_w = rest * told[i - 1, 0], (1.0 - slip) * told[i - 1, 1] - own[DRIFT]
         last_v, last_w = speed, rate
         turned = rate * dt
         half = 0.5 * turned
@@ -136,7 +141,7 @@ def drive(own, time_s, told, from_s, until_s, rough, pose, by, stray):
     by[0, TURN], by[1, TURN], by[2, TURN] = x_turn, y_turn, -turn_sum
     by[0, TURN_SLIP], by[1, TURN_SLIP], by[2, TURN_SLIP] = x_turn, y_turn, -turn_sum
     by[0, DRIFT], by[1, DRIFT], by[2, DRIFT] = x_drift, y_drift, -span
-    # later by lag: a piece more at the start, which turns the rest, and one less at the end
+    # later by lag: a piece more at the start, of what was told until then, which turns the rest; one less at the end
     c0, s0 = np.cos(own[YAW]), np.sin(own[YAW])
     by[0, LAG] = first_v * c0 - first_w * dy - last_v * np.cos(yaw)
     by[1, LAG] = first_v * s0 + first_w * dx - last_v * np.sin(yaw)

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from sonofix.records import Floats
 from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import SLIPPED, Belief, Moment
+from sonofix.team.fleet import START_SD, Belief, Moment
 from sonofix.team.hear import REFUSED, age, spread
 from sonofix.team.kernel import STRAYS, advance, drive, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
+from sonofix.team.pushed import SLIPPED
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior_sd, wander_psd
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
@@ -112,7 +113,7 @@ def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Fl
             continue
         begin = min(int(np.searchsorted(times, told[0])), int(at[0]))
         active[begin : at[0], r] = True
-        opened[begin, r] = np.square(OPEN_SD)
+        opened[begin, r] = np.square(START_SD if r in feed.starts and begin == at[0] == 0 else OPEN_SD)
         again = at[1:][np.diff(at) > 1]
         opened[again, r] = np.square(OPEN_SD)
     index = {name: r for r, name in enumerate(feed.robots)}
@@ -221,7 +222,7 @@ def _pass(
             if opened[k, r].any():
                 at = np.arange(SIZE * r, SIZE * r + POSE)
                 if k == 0 or not active[k - 1, r]:
-                    mean[at] = nominal[k, at]
+                    mean[at] = feed.starts[r] if k == 0 and r in feed.starts else nominal[k, at]
                     covariance[at, :] = covariance[:, at] = 0.0
                     bys[k, r][:] = 0.0
                 covariance[at, at] += opened[k, r]

@@ -12,11 +12,11 @@ from sonofix.team.feed import Feed
 from sonofix.team.fleet import Moment
 
 
-def ranges_of(steps: Iterable[Step]) -> RangeRows:
-    """Return the ranges that a receiver made of samples, each with its deviation."""
+def ranges_of(epochs: Iterable[RangeEpoch]) -> RangeRows:
+    """Return the ranges that a receiver made of samples, or that exchanges are, each with its deviation."""
     found = [
         (float(e.time_s[i]), e.emitter[i], e.receiver[i], float(e.range_m[i]), float(np.sqrt(e.covariance_m2[i, i])))
-        for e in (step.ranges for step in steps)
+        for e in epochs
         for i in range(len(e))
     ]
     time_s, emitter, receiver, range_m, sd_m = zip(*found, strict=True) if found else ((), (), (), (), ())

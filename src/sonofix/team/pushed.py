@@ -1,0 +1,194 @@
+"""Where a robot is that was pushed, and since when: what was heard just before and after is heard anew, many ways.
+
+A push takes a while, and what is heard meanwhile belongs to neither place. So the robot's place is opened before that
+began and again for the latest that was heard, as much as tells a place and whether it fits; what was heard of it in
+between is left out. It is sought in all directions; where two places would do, such as mirror images in the line of two
+others, and neither is much nearer, it is not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sonofix.records import Floats
+from sonofix.team.feed import SIGHTING, Feed
+from sonofix.team.hear import REFUSED
+from sonofix.team.state import POSE
+
+if TYPE_CHECKING:
+    from sonofix.team.fleet import Belief
+
+SLIPPED = (3.0, 3.0, 0.5)
+"""How far aside a robot may be found that was pushed, in m and rad."""
+
+ITERATED = 8
+
+SETTLED = 1e-3
+"""In m and rad: a place that moved less from one linearisation to the next is found."""
+
+SPARE = 2
+"""Measurements that must fit beyond those that a pose takes: as many as are sought always do."""
+
+SPAN_S = 0.3
+"""What is heard within less may all be of a push that goes on."""
+
+LOOSE = 4.0
+"""What their squares, over their variances, may come to, each."""
+
+BEFORE = 3
+"""So many times before the first that was refused, what was heard of it may be of the push already."""
+
+DIRECTIONS = 8
+"""In which it is sought besides."""
+
+FARTHER = 2.0
+"""What a place is taken to cost by each metre that it is off: pushes over a metre are e times rarer."""
+
+RIVALS = 9.0
+"""How much more another place must cost."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Before:
+    """A belief as it was before what was heard at an instant."""
+
+    time_s: float
+    rows: tuple[int, int]
+    mean: Floats
+    covariance: Floats
+    last: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What hearing anew led to.
+
+    Attributes
+    ----------
+    mean, covariance, last : float64 (n,), (n, n), (W, 2)
+        Of the belief.
+    shift : float64 (POSE,)
+        How far aside the robot is from where its odometry has it.
+    cost : float
+        Squares, over their variances, of what the latest measurements of the robot left, and its distance.
+    fits : bool
+        Whether all these were taken, and fit together.
+    missed_m : float
+        The most by which a range of these was off.
+    """
+
+    mean: Floats
+    covariance: Floats
+    last: Floats
+    shift: Floats
+    cost: float
+    fits: bool
+    missed_m: float
+
+
+def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Before]) -> Found | None:
+    """Find a robot that was pushed.
+
+    Parameters
+    ----------
+    belief : Belief
+        Is left as it was.
+    feed : Feed
+    robot : int
+    first : int
+        The first row of it that was refused.
+    past : sequence of Before
+        Instants until now.
+
+    Returns
+    -------
+    Found or None
+        None: too little was heard since to tell, nothing explains it, or more places than one do.
+    """
+    own = [k for k, before in enumerate(past) if any(_of(feed, robot, i) for i in range(*before.rows))]
+    refused = next((k for k, before in enumerate(past) if before.rows[1] > first), len(past))
+    before = [k for k in own if k < refused][-BEFORE:]
+    begin = before[0] if before else 0
+    over = next((k for k in reversed(own) if k >= refused and _told(feed, robot, past[k:])), None)
+    if over is None:
+        return None
+    kept = belief.mean.copy(), belief.covariance.copy(), belief.last.copy()
+    since = past[begin:]
+    near = _settled(belief, feed, robot, since, over - begin, np.zeros(POSE))
+    turns = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    aside = near.missed_m * np.column_stack([np.cos(turns), np.sin(turns), np.zeros(DIRECTIONS)])
+    found = [near, *(_settled(belief, feed, robot, since, over - begin, one) for one in aside)]
+    belief.mean[:], belief.covariance[:], belief.last[:] = kept
+    found = sorted((one for one in found if one.fits), key=lambda one: one.cost)
+    at = belief.at(robot)
+    for one in found[1:]:
+        spread = np.trace(found[0].covariance[at, at][:2, :2])
+        if one.cost - found[0].cost < RIVALS and np.sum((one.shift - found[0].shift)[:2] ** 2) > REFUSED * spread:
+            return None
+    return found[0] if found else None
+
+
+def _told(feed: Feed, robot: int, steps: Sequence[Before]) -> bool:
+    """Whether what was heard of a robot tells its pose, and whether it fits."""
+    rows = [i for before in steps for i in range(*before.rows) if _of(feed, robot, i)]
+    partners = {(feed.source if feed.listener[i] == robot else feed.listener)[i] for i in rows}
+    fixed = {int(feed.pair[i]) for i in rows if min(feed.listener[i], feed.source[i]) < 0}
+    ranges, bearings = (int(np.isfinite(column[rows]).sum()) for column in (feed.range_m, feed.bearing_rad))
+    if not rows or feed.time_s[rows[-1]] - feed.time_s[rows[0]] < SPAN_S:
+        return False
+    return len(partners - {-1}) + len(fixed) >= 2 and ranges + bearings >= 2 + bool(bearings) + SPARE
+
+
+def _of(feed: Feed, robot: int, row: int) -> bool:
+    """Whether a row is a sighting by a robot, or of it."""
+    return bool(feed.kind[row] == SIGHTING and robot in (feed.listener[row], feed.source[row]))
+
+
+def _settled(belief: Belief, feed: Feed, robot: int, since: Sequence[Before], over: int, shift: Floats) -> Found:
+    """Hear anew about what it leads to, until that stays (Bell and Cathey 1993)."""
+    found = _again(belief, feed, robot, since, over, shift)
+    for _ in range(ITERATED - 1):
+        if np.max(np.abs(found.shift - shift)) < SETTLED:
+            break
+        shift = found.shift
+        found = _again(belief, feed, robot, since, over, shift)
+    return found
+
+
+def _again(belief: Belief, feed: Feed, robot: int, since: Sequence[Before], over: int, shift: Floats) -> Found:
+    """Hear what came ``since``; of the robot, what came before instant ``over`` is left out."""
+    at, cost, count, fits, missed_m = belief.at(robot), 0.0, 0, True, 0.0
+    belief.mean[:], belief.covariance[:], belief.last[:] = since[0].mean, since[0].covariance, since[0].last
+    belief.loosen(robot, SLIPPED)
+    track = belief.mean.copy()
+    for k, step in enumerate(since):
+        if k:
+            own, shared = belief.mean.copy(), belief.covariance.copy()
+            belief.mean[:] = track
+            belief.drive(feed, since[k - 1].time_s, step.time_s)
+            track = belief.mean.copy()
+            belief.mean[:], belief.covariance[:] = own, shared
+            belief.drive(feed, since[k - 1].time_s, step.time_s)
+        if k == over and k:
+            belief.loosen(robot, SLIPPED)
+        about = belief.mean.copy()
+        about[at] = track[at] + shift
+        belief.placed[robot] = k >= over
+        used, told = belief.hear(feed, step.rows, about)
+        belief.placed[robot] = True
+        if k < over:
+            continue
+        mine = np.array([_of(feed, robot, i) for i in range(*step.rows)], bool)
+        asked = np.isfinite(told[:, :, 2]) & mine[:, None]
+        cost += float(np.sum(told[asked][:, 0] ** 2 / (told[asked][:, 1] + told[asked][:, 3])))
+        fits &= bool(used[asked].all())
+        count += int(asked.sum())
+        missed_m = max([missed_m, *np.abs(told[asked[:, 0], 0, 0]).tolist()])
+    found = belief.mean[at] - track[at]
+    fits &= cost <= LOOSE * count
+    cost += FARTHER * float(np.hypot(*found[:2]))
+    return Found(belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), found, cost, fits, missed_m)
