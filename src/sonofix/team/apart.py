@@ -3,8 +3,8 @@
 When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that
 both know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013):
 the part of an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and
-1/(1 − w); the part that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has
-been told. So estimates are never surer than they may be, whoever tells whom however often, joins or leaves.
+1/(1 − w); the rest is a robot's own (`meeting`). So estimates are never surer than they may be, whoever tells whom
+however often, joins or leaves.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ SURE = (0.5, 0.3)
 
 UNSURE = (1.5, 0.6)
 """In m and rad: a robot that knows its place no better is to be placed anew, as corrections are no longer linear: of
-headings that stray by σ, the way along their mean is exp(−σ²/2) of itself, 12 % less, which is about what odometry errs
-by before anything was heard."""
+headings that stray by σ, the way along their mean is exp(−σ²/2) of itself, a sixth less."""
 
 PLACED_SD = (1.0, 0.5)
 """In m and rad: clues that tell no better place nobody."""
@@ -316,12 +315,12 @@ def _join(team: Apart, recent: Recent, robot: int, time_s: float, events: list[E
     if belief.placed[robot]:
         if np.linalg.det(found.covariance) > GAIN * np.linalg.det(belief.covariance[at, at]):
             return
-        text = "placed anew, as that is surer"
+        event, text = "placed", "placed anew, as that is surer,"
         _lift(team, robot)
     else:
-        text = "placed"
+        event, text = "joined", "placed"
     belief.put(robot, Placed(found.pose, found.covariance, {}))
     team.dependent[at, at] = found.covariance
     x, y, yaw = found.pose
     text += f" at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
-    events.append(Event(time_s, team.feed.robots[robot], "joined", text))
+    events.append(Event(time_s, team.feed.robots[robot], event, text))
