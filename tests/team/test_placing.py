@@ -7,7 +7,7 @@ SPREAD = np.diag([0.15, 0.15, 0.1]) ** 2
 
 
 def clues(rng, known: bool) -> tuple[Clues, np.ndarray, np.ndarray]:
-    """Return what two robots that err alike all the time tell one that passes, and its pose in its own frame and truly."""
+    """Return what two robots that err alike all the time tell one that passes, its pose in its own frame, and truly."""
     m = 8
     along = np.linspace(0.0, 2.0, m)
     own = np.column_stack([along, 0.3 * along**2, np.arctan(0.6 * along)])

@@ -94,14 +94,11 @@ class Corrected:
         What is left of the error there was.
     whole : float64 (n, n)
         The covariance now.
-    noise : float64 (n, n)
-        The part of that which noise alone makes.
     """
 
     moved: Floats
     left: Floats
     whole: Floats
-    noise: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +118,9 @@ def judge(error: Split, heard: Heard) -> Judged:
     """Correct a robot by what was heard, which holds whatever it and its partner share.
 
     With w that leaves the pose best known, the shared part of its error is taken 1/w times as large and its partner's
-    1/(1 − w). Noise is widened by what a straight line misses, ½ tr(B S B S) with S the covariance of where the two
-    stand to each other (Bar-Shalom, Li and Kirubarajan 2001, eq. 10.3.2-16).
+    1/(1 − w); so is noise, as errors of a view last from one meeting to the next. It is widened besides by what a
+    straight line misses, ½ tr(B S B S) with S the covariance of where the two stand to each other (Bar-Shalom, Li and
+    Kirubarajan 2001, section 10.3.2).
     """
     best: tuple[float, float] | None = None
     for share in SHARES:
@@ -146,21 +144,19 @@ def judge(error: Split, heard: Heard) -> Judged:
     before = float(np.linalg.det(error.whole[:POSE, :POSE]))
     if float(np.linalg.det(new[:POSE, :POSE])) > GAIN * before:
         return Judged(None, *judged)
-    return Judged(Corrected(gain @ heard.off, left, new, gain @ np.diag(noise) @ gain.T), *judged)
+    return Judged(Corrected(gain @ heard.off, left, new), *judged)
 
 
 def settle(error: Split, corrected: Corrected | None, partner_took: bool, rows: Floats) -> Split:
     """Return a robot's error after a meeting, at which its partner was told ``rows`` (k, n) of it, if that took them.
 
-    Of a correction that both made, noise too is shared.
+    What a correction brings in, noise too, is shared.
     """
     if partner_took:
         error = error.told(rows)
     if corrected is None:
         return error
     own = corrected.left @ (error.whole - error.shared) @ corrected.left.T
-    if not partner_took:
-        own = own + corrected.noise
     return Split(corrected.whole, _even(corrected.whole - own))
 
 
@@ -177,7 +173,7 @@ def _widened(error: Split, heard: Heard, share: float) -> tuple[Floats, Floats, 
     whole = error.widened(1.0 / share)
     expected = heard.rows @ whole @ heard.rows.T + heard.partner.widened(1.0 / (1.0 - share))
     apart = heard.bent @ (whole[:2, :2] + heard.place.widened(1.0 / (1.0 - share)))
-    return whole, expected, heard.noise + 0.5 * np.einsum("kij,kji->k", apart, apart)
+    return whole, expected, heard.noise / (1.0 - share) + 0.5 * np.einsum("kij,kji->k", apart, apart)
 
 
 def _even(square: Floats) -> Floats:
