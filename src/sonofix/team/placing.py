@@ -161,18 +161,17 @@ def _cost(clues: Clues, frame: Floats) -> float:
     square, new = np.minimum(missed.residual**2, LIMIT**2), missed.new
     if clues.shared is None:
         return float(np.sum(square))
-    told = _told(clues)
-    which = np.concatenate([clues.pair, -1 - clues.pair])[told]
-    _, place, count = np.unique(which, return_inverse=True, return_counts=True)
+    _, place, count = np.unique(_kinds(clues), return_inverse=True, return_counts=True)
     return float(np.sum(square * (new + (1.0 - new) / count[place])))
 
 
 def _bounded(clues: Clues, shared: Shared, frame: Floats, kept: NDArray[np.bool_], gain: Floats) -> Floats:
-    """Return the covariance (3, 3) of a place by clues whose errors, but for what is new each time, may be shared.
+    """Return the covariance (3, 3) of a place by clues that share errors.
 
-    ``gain`` (3, k) says what whitened misses make of the place. With u of each shared error that it makes, the sum's
-    covariance is no larger than that of each, 1/ω times as large, whatever they share, if Σ ω = 1 (covariance
-    intersection); here ω goes with their deviations.
+    ``gain`` (3, k) says what whitened misses make of the place. Half of noise lasts for all clues of a pair, and
+    errors of odometry for all clues. What others, and ways untold, make of the place may be shared to any degree: the
+    sum's covariance is no larger than that of each, 1/ω times as large, if Σ ω = 1 (covariance intersection); here ω
+    goes with their deviations.
     """
     missed = _residuals(clues, frame)
     m, turn = len(clues.range_m), _turn(frame)
@@ -182,12 +181,19 @@ def _bounded(clues: Clues, shared: Shared, frame: Floats, kept: NDArray[np.bool_
     for k in np.unique(row).tolist():
         some = row == k
         alike = by_other[some] @ shared.spread[k] @ by_other[some].T + by_own[some] @ shared.stray[k] @ by_own[some].T
-        alike += BEGIN_SHARE / (1.0 - BEGIN_SHARE) * np.diag(new[some])
         parts.append(gain[:, some] @ alike @ gain[:, some].T)
     scale = np.sqrt([np.trace(part) for part in parts])
     bound = np.sum([part * scale.sum() / max(one, 1e-12) for part, one in zip(parts, scale, strict=True)], axis=0)
     by_odometry = gain @ np.einsum("ki,kiq->kq", by_own, shared.astray[row])
-    return bound + gain @ (new[:, None] * gain.T) + by_odometry @ by_odometry.T
+    lasting = np.sqrt(BEGIN_SHARE / (1.0 - BEGIN_SHARE) * new)
+    which = _kinds(clues)[kept]
+    by_views = np.column_stack([gain[:, which == one] @ lasting[which == one] for one in np.unique(which)])
+    return bound + gain @ (new[:, None] * gain.T) + by_odometry @ by_odometry.T + by_views @ by_views.T
+
+
+def _kinds(clues: Clues) -> NDArray[np.int64]:
+    """Return numbers (k,) of what is measured of whom: ranges and bearings of each pair."""
+    return np.concatenate([clues.pair, -1 - clues.pair])[_told(clues)]
 
 
 def _turn(frame: Floats) -> Floats:
