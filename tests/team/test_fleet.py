@@ -219,7 +219,8 @@ def test_decentralised_is_never_overconfident_nor_surer_than_all_at_once():
         ratios.append(nees(*errors(apart, truth, after_s=10)))
         both = [(a, b) for a, b in zip(apart, together, strict=True) if a.placed.all() and b.placed.all()]
         wider += [a.covariance[2, :2, :2].trace() / b.covariance[2, :2, :2].trace() for a, b in both]
-    assert np.mean(ratios) < 2.7
+    # 2 where deviations are right; bounds that hold whatever robots share are wider
+    assert np.mean(ratios) < 2.0
     # noise is learnt apart, so now and then one is a little surer
     assert np.median(wider) > 1.0
 

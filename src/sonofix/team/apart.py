@@ -3,8 +3,8 @@
 When a robot hears another, both send a `Message`; each then corrects itself. What they tell may rest on things that
 both know already, so it is fused by split covariance intersection (Julier and Uhlmann 2001; Li and Nashashibi 2013):
 the part of an error that was ever told, or came from others, may be shared to any degree and is widened by 1/w and
-1/(1 − w); the part that grew since, by own odometry and landmarks, is a robot's own. After an exchange all of it has
-been told. So estimates are never surer than they may be, whoever tells whom however often, joins or leaves.
+1/(1 − w); the rest is a robot's own (`meeting`). So estimates are never surer than they may be, whoever tells whom
+however often, joins or leaves.
 """
 
 from __future__ import annotations
@@ -20,28 +20,27 @@ from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.fleet import ASK_S, LEFT_S, START_SD, Belief, Moment, Watch, instants
 from sonofix.team.hear import TOLD as HEARD
 from sonofix.team.hear import age
-from sonofix.team.message import SENT, Message, unpack
-from sonofix.team.noise import BEARING, NEW, Noise, fade, noise, variance_of
+from sonofix.team.kernel import expect, turned_by
+from sonofix.team.meeting import GAIN, Heard, Split, bends, judge, settle
+from sonofix.team.message import SENT, TOLD, Message, unpack
+from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, noise, variance_of
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
-from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP
-
-SHARES = (0.3, 0.5, 0.7, 0.85, 0.95)
-"""Weights w of a robot's own estimate that are tried; the one that leaves its place best known is taken."""
-
-GAIN = 0.8
-"""The determinant of a pose's covariance must fall to so much of itself, or nothing is changed."""
+from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, X, Y
 
 EVERY_S = 1.0
 """Two robots that meet tell each other no more often."""
 
-SURE = (0.3, 0.2)
+SURE = (0.5, 0.3)
 """In m and rad: only a robot that knows its place so well may place another."""
 
-UNSURE = (1.0, 0.35)
+UNSURE = (1.5, 0.6)
 """In m and rad: a robot that knows its place no better is to be placed anew, as corrections are no longer linear: of
-headings that stray by σ, the way along their mean is exp(−σ²/2) of itself, 6 % less."""
+headings that stray by σ, the way along their mean is exp(−σ²/2) of itself, a sixth less."""
+
+PLACED_SD = (1.0, 0.5)
+"""In m and rad: clues that tell no better place nobody."""
 
 
 class Apart:
@@ -111,8 +110,10 @@ class Apart:
         self.rough.slipped(belief, robot, time_s)
         if used.any():
             # all corrections together are x' = A x + K z with A P = P'; states that are known have no part in it
-            kept = belief.covariance[at] @ np.linalg.pinv(before, hermitian=True)
-            self.dependent[at] = kept @ self.dependent[at] @ kept.T
+            open_ = np.flatnonzero(np.diag(before) > 0)
+            some = np.ix_(self._own[robot][open_], self._own[robot][open_])
+            kept = np.linalg.solve(before[np.ix_(open_, open_)], belief.covariance[some]).T
+            self.dependent[some] = kept @ self.dependent[some] @ kept.T
         return used, found
 
     def _age(self, row: int, told: Noise) -> float:
@@ -131,86 +132,103 @@ class Apart:
 
     def _exchange(self, row: int, listener: int, source: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
         """Let two robots that meet tell each other, and correct themselves by it."""
-        time_s = float(self.feed.time_s[row])
+        time_s, stays = float(self.feed.time_s[row]), 0.0
         measured = np.full(4, np.nan)
-        measured[:2] = self.feed.range_m[row], self.feed.bearing_rad[row]
-        if np.isfinite(measured[0]):
-            measured[2] = variance_of(told.known, listener, NEW, measured[0]) * told.swell[listener, 0]
-        measured[3] = variance_of(told.known, listener, BEARING, measured[0]) * told.swell[listener, 1]
+        range_m = float(self.feed.range_m[row])
+        measured[:2] = range_m, self.feed.bearing_rad[row]
+        stated = self.feed.range_sd_m[row] ** 2 if np.isfinite(self.feed.range_sd_m[row]) else 0.0
+        measured[2] = stated
+        measured[3] = variance_of(told.known, listener, BEARING, range_m)
+        if not told.believed:
+            measured[2] += variance_of(told.known, listener, NEW, range_m) * told.swell[listener, 0]
+            measured[3] *= told.swell[listener, 1]
+            stays = float(np.sqrt(variance_of(told.known, listener, STAYING, range_m)))
         for end in (listener, source):
             self.rough.take(self.feed, self.belief, told, (row, row + 1), end, time_s)
         self._age(row, told)
-        pair = None if told.believed else SIZE * len(self.feed.robots) + int(self.feed.view[row])
         said = {
-            listener: unpack(self._say(listener, time_s, measured, pair)),
-            source: unpack(self._say(source, time_s, np.full(4, np.nan), None)),
+            listener: unpack(self._say(listener, time_s, measured, self._pair(row), stays)),
+            source: unpack(self._say(source, time_s, np.full(4, np.nan), None, 0.0)),
         }
         self.told += 2
-        mean, covariance = self.belief.mean.copy(), self.belief.covariance.copy()
-        result = np.zeros((1, 2), bool), np.full((1, 2, HEARD), np.nan)
-        corrected: dict[int, tuple[Floats, Floats]] = {}
-        heard = result
+        heard = {
+            robot: self._hear_of(row, robot == listener, said[other], measured, stays)
+            for robot, other in ((listener, source), (source, listener))
+        }
+        used, found = np.zeros((1, 2), bool), np.full((1, 2, HEARD), np.nan)
+        if not heard[listener].off.size:
+            return used, found
+        error = {robot: self._error(robot) for robot in heard}
+        judged = {robot: judge(error[robot], heard[robot]) for robot in heard}
         for robot, other in ((listener, source), (source, listener)):
-            best: tuple[float, Floats, Floats] | None = None
-            for share in SHARES:
-                bound = self._bound(mean, covariance, robot, said[other], share, pair if other == listener else None)
-                heard = bound.hear_with(self.feed, row, told)
-                at = self.own(robot)
-                size = float(np.linalg.det(bound.belief.covariance[at][:POSE, :POSE]))
-                if heard[0].any() and (best is None or size < best[0]):
-                    best = size, bound.belief.mean[self._own[robot]], bound.belief.covariance[at]
-                    if robot == listener:
-                        result = heard
-            now = float(np.linalg.det(covariance[self.own(robot)][:POSE, :POSE]))
-            if best is not None and best[0] < GAIN * now:
-                corrected[robot] = best[1], best[2]
-            if robot == listener and best is None:
-                result = heard
-        for robot in (listener, source):
-            at = self.own(robot)
-            if robot in corrected:
-                self.belief.mean[self._own[robot]], self.belief.covariance[at] = corrected[robot]
-            self.dependent[at] = self.belief.covariance[at]
+            corrected = judged[robot].corrected
+            took = judged[other].corrected is not None
+            left = settle(error[robot], corrected, took, heard[robot].rows)
+            self.belief.covariance[self.own(robot)], self.dependent[self.own(robot)] = left.whole, left.shared
+            if corrected is not None:
+                self.belief.mean[self._own[robot]] += corrected.moved
             self.rough.slipped(self.belief, robot, time_s)
-        return result
+        said_of = judged[listener]
+        at = np.flatnonzero(np.isfinite(measured[:2]))
+        used[0, at] = said_of.used
+        found[0, at, 0], found[0, at, 1] = heard[listener].off, said_of.expected
+        found[0, at, 2] = found[0, at, 3] = said_of.taken
+        return used, found
 
-    def _say(self, robot: int, time_s: float, measured: Floats, pair: int | None) -> bytes:
-        """Return a robot's message; ``pair``: where the error of what it measured stands."""
+    def _pair(self, row: int) -> int | None:
+        """Where the error of the pair stands that a row was heard by."""
+        own = self.feed.own_ranges or not np.isfinite(self.feed.range_m[row])
+        return None if own else SIZE * len(self.feed.robots) + int(self.feed.view[row])
+
+    def _hear_of(self, row: int, listens: bool, other: Message, measured: Floats, stays: float) -> Heard:
+        """Return what a row says of one of its ends, the other of which told of itself."""
+        feed = self.feed
+        robot = int(feed.listener[row] if listens else feed.source[row])
+        here, there = (0, SIZE) if listens else (SIZE, 0)
+        about, by, speed = np.zeros(2 * SIZE), np.zeros((2, 2 * SIZE)), np.zeros(2)
+        about[here : here + SIZE] = self.belief.mean[SIZE * robot : SIZE * (robot + 1)]
+        about[there + np.array(SENT)] = other.mean[: len(SENT)]
+        speed[1] = self.belief.speed[feed.source[row]]
+        shown, direction, _ = expect(
+            about, 0, 1, feed.listener_point[row], feed.source_point[row], 1.0 / feed.sound_speed_mps, speed, by
+        )
+        own = self._own[robot]
+        rows, others = np.zeros((2, len(own))), np.zeros((2, TOLD))
+        rows[:, :SIZE], others[:, : len(SENT)] = by[:, here : here + SIZE], by[:, there + np.array(SENT)]
+        pair = self._pair(row)
+        if pair is not None and listens:
+            rows[0, np.flatnonzero(own == pair)] = stays
+            shown += stays * self.belief.mean[pair]
+        elif not listens:
+            others[0, -1] = 1.0
+            shown += other.mean[-1]
+        off = np.array([measured[0] - shown, turned_by(measured[1] - direction)])
+        at = np.flatnonzero(np.isfinite(off))
+        dx, dy = about[SIZE + X] - about[X], about[SIZE + Y] - about[Y]
+        error = Split(other.covariance, other.dependent)
+        place = Split(error.whole[:2, :2], error.shared[:2, :2])
+        return Heard(off[at], rows[at], error.within(others[at]), measured[2:][at], bends(dx, dy)[at], place)
+
+    def tell(self, robot: int) -> None:
+        """Tell others a robot's pose."""
+        told = self._error(robot).told(np.eye(POSE, len(self._own[robot])))
+        self.dependent[self.own(robot)] = told.shared
+
+    def _error(self, robot: int) -> Split:
+        at = self.own(robot)
+        return Split(self.belief.covariance[at], self.dependent[at])
+
+    def _say(self, robot: int, time_s: float, measured: Floats, pair: int | None, stays: float) -> bytes:
+        """Return a robot's message; ``pair``: where the error of what it measured stands, ``stays``: its metres."""
         at = np.append(np.array(SENT) + SIZE * robot, 0 if pair is None else pair)
         mean, both = self.belief.mean[at], np.ix_(at, at)
         covariance, dependent = self.belief.covariance[both], self.dependent[both]
-        if pair is None:
-            mean[-1] = 0.0
-            for square in (covariance, dependent):
-                square[-1, :] = square[:, -1] = 0.0
+        in_m = 0.0 if pair is None else stays
+        mean[-1] *= in_m
+        for square in (covariance, dependent):
+            square[-1, :] *= in_m
+            square[:, -1] *= in_m
         return Message(robot, time_s, mean, covariance, dependent, measured).pack()
-
-    def _bound(
-        self, mean: Floats, covariance: Floats, robot: int, other: Message, share: float, pair: int | None
-    ) -> _Bound:
-        """Return a belief of a robot and one that it hears of, which holds whatever they share."""
-        bound = np.zeros_like(covariance)
-        at = self.own(robot)
-        bound[at] = covariance[at] + (1.0 / share - 1.0) * self.dependent[at]
-        of = np.array(SENT) + SIZE * other.sender
-        told = slice(len(of) + (pair is not None))
-        of = of if pair is None else np.append(of, pair)
-        widened = other.covariance + (1.0 / (1.0 - share) - 1.0) * other.dependent
-        bound[np.ix_(of, of)] = widened[told, told]
-        about = mean.copy()
-        about[of] = other.mean[told]
-        return _Bound(replace(self.belief, mean=about, covariance=bound, last=self.belief.last.copy()))
-
-
-class _Bound:
-    """A belief made for one correction."""
-
-    def __init__(self, belief: Belief) -> None:
-        self.belief = belief
-
-    def hear_with(self, feed: Feed, row: int, told: Noise) -> tuple[NDArray[np.bool_], Floats]:
-        """Take a row in, with what its listener knows of its noise."""
-        return replace_noise(self.belief, told).hear(feed, (row, row + 1))
 
 
 def replace_noise(belief: Belief, told: Noise) -> Belief:
@@ -243,20 +261,24 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
         if found is not None:
             robot = found[0]
             watch.clear(robot)
-            _lift(team, recent, robot)
+            _lift(team, robot)
+            recent.forget(robot)
             text = "what is heard disagrees with its track: to be placed anew"
             events.append(Event(time_s, feed.robots[robot], "lost", text))
-        recent.add(belief.mean, belief.placed, (first, last), _sure(belief))
+        sure = _sure(belief)
+        for robot in recent.add(belief.mean, sure, (first, last), sure, belief.covariance):
+            team.tell(robot)
         if time_s - asked_s >= ASK_S:
             asked_s = time_s
             for robot in range(len(feed.robots)):
                 if belief.placed[robot] and time_s - recent.told_s(robot, time_s) > LEFT_S:
-                    _lift(team, recent, robot)
+                    _lift(team, robot)
+                    recent.forget(robot)
                     events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
                 elif belief.placed[robot] and _unsure(belief, robot):
-                    _lift(team, recent, robot)
+                    _lift(team, robot)
                     events.append(Event(time_s, feed.robots[robot], "lost", "it hardly knows where it is"))
-                elif not belief.placed[robot]:
+                elif not sure[robot]:
                     _join(team, recent, robot, time_s, events)
         yield belief.moment(time_s, (first, last), used, events), team
 
@@ -275,27 +297,30 @@ def _sure(belief: Belief) -> NDArray[np.bool_]:
     return belief.placed & [_within(belief, robot, SURE) for robot in range(len(belief.placed))]
 
 
-def _lift(team: Apart, recent: Recent, robot: int) -> None:
+def _lift(team: Apart, robot: int) -> None:
     at = team.belief.at(robot)
     team.belief.lift(robot)
     team.dependent[at, :] = team.dependent[:, at] = 0.0
     team.rough.forget(robot)
-    recent.forget(robot)
 
 
 def _join(team: Apart, recent: Recent, robot: int, time_s: float, events: list[Event]) -> None:
     """Place a robot by landmarks and by what others said of themselves, whose errors may all be shared."""
     belief = team.belief
-    clues = recent.clues(robot, time_s, _sure(belief))
-    found = None if clues is None else place(clues, belief.mean[belief.at(robot)])
+    clues = recent.clues(robot, time_s, _sure(belief), belief)
+    found = None if clues is None else place(clues, belief.mean[belief.at(robot)], PLACED_SD)
     if found is None:
         return
-    covariance = found.covariance.copy()
-    for who, by in found.by.items():
-        covariance += len(found.by) * by @ belief.covariance[belief.at(who), belief.at(who)] @ by.T
-    belief.put(robot, Placed(found.pose, covariance, {}))
-    for who in (robot, *found.by):
-        team.dependent[team.own(who)] = belief.covariance[team.own(who)]
+    at = belief.at(robot)
+    if belief.placed[robot]:
+        if np.linalg.det(found.covariance) > GAIN * np.linalg.det(belief.covariance[at, at]):
+            return
+        event, text = "placed", "placed anew, as that is surer,"
+        _lift(team, robot)
+    else:
+        event, text = "joined", "placed"
+    belief.put(robot, Placed(found.pose, found.covariance, {}))
+    team.dependent[at, at] = found.covariance
     x, y, yaw = found.pose
-    text = f"placed at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
-    events.append(Event(time_s, team.feed.robots[robot], "joined", text))
+    text += f" at ({x:.3f}, {y:.3f}) m, heading {np.degrees(yaw) % 360:.0f}°"
+    events.append(Event(time_s, team.feed.robots[robot], event, text))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Floats
+from sonofix.team.noise import BEGIN_SHARE
 from sonofix.track.stated import BEGIN_SD_M, SCALE_SD
 from sonofix.track.wheels import COMPASS_SD_RAD
 
@@ -30,6 +31,9 @@ LIMIT = 3.0
 RIVALS = 9.0
 """How much more another place must cost."""
 
+WAY_SD, TURN_SD = 0.1, 0.15
+"""Of odometry of whose errors nothing is told, per metre and radian."""
+
 LEAST = 6
 """Ranges and bearings that must agree: what is sought told twice over, as one thing heard may have been another."""
 
@@ -39,8 +43,24 @@ AGREEING = 0.7
 PLACED_SD = (0.5, 0.3)
 """In m and rad: a place that is known no better is none."""
 
-WAY_SD, TURN_SD = 0.1, 0.15
-"""Of odometry whose errors are not known, per metre and radian."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shared:
+    """Errors that some of m clues may have in common.
+
+    Attributes
+    ----------
+    spread : float64 (m, 3, 3)
+        Covariance of the other end's pose, shared to any degree; zeros where it is fixed.
+    astray : float64 (m, 3, q)
+        Derivative of the robot's own pose, seen from where it is now, by q errors of odometry of unit variance.
+    stray : float64 (m, 3, 3)
+        Covariance of what odometry does not tell of the way since.
+    """
+
+    spread: Floats
+    astray: Floats
+    stray: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +83,10 @@ class Clues:
         NaN where not measured.
     compass : bool (m,)
         ``bearing_rad`` is the robot's heading, by its compass.
+    pair : int (m,)
+        Number of its pair of ends.
+    shared : Shared or None
+        What is known of errors that clues have in common. None: they are taken for new each time.
     """
 
     own: Floats
@@ -73,8 +97,10 @@ class Clues:
     range_m: Floats
     bearing_rad: Floats
     compass: NDArray[np.bool_]
+    pair: NDArray[np.int64]
+    shared: Shared | None
     doubt: Floats | None = None
-    """What odometry may have erred since each row, (m, 2), in m and rad; `place` fills it in."""
+    """Where nothing is known of such, by how much odometry may have erred since, (m, 2) in m and rad: `place` tells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +112,11 @@ class Placed:
     by: dict[int, Floats]
 
 
-def place(clues: Clues, now: Floats) -> Placed | None:
-    """Return where a robot is whose odometry has it at ``now`` (3,) in its own frame; None where clues do not say."""
+def place(clues: Clues, now: Floats, sd: tuple[float, float] = PLACED_SD) -> Placed | None:
+    """Return where a robot is whose odometry has it at ``now`` (3,) in its own frame; None where clues do not say.
+
+    ``sd``: in m and rad, how well they must.
+    """
     told = np.count_nonzero(np.isfinite(clues.range_m)) + np.count_nonzero(np.isfinite(clues.bearing_rad))
     if told < LEAST:
         return None
@@ -95,10 +124,11 @@ def place(clues: Clues, now: Floats) -> Placed | None:
     clues = replace(clues, doubt=_doubt(clues, now))
     for start in _starts(clues):
         found = _settle(clues, start)
-        best.append((float(np.sum(np.minimum(_residuals(clues, found)[0] ** 2, LIMIT**2))), found))
+        best.append((_cost(clues, found), found))
     best.sort(key=lambda pair: pair[0])
     cost, found = best[0]
-    residual, by, by_other = _residuals(clues, found)
+    missed = _residuals(clues, found)
+    residual, by, by_other = missed.residual, missed.by, missed.by_other
     kept = np.abs(residual) < LIMIT
     if np.count_nonzero(kept) < max(LEAST, AGREEING * len(residual)):
         return None
@@ -115,12 +145,61 @@ def place(clues: Clues, now: Floats) -> Placed | None:
     turn = np.eye(3)
     turn[:2, 2] = [-sin * now[0] - cos * now[1], cos * now[0] - sin * now[1]]
     spread = turn @ covariance @ turn.T
-    if np.sqrt(max(spread[0, 0], spread[1, 1])) > PLACED_SD[0] or np.sqrt(spread[2, 2]) > PLACED_SD[1]:
+    if clues.shared is not None:
+        spread = _bounded(clues, clues.shared, found, kept, -turn @ covariance @ by[kept].T)
+    if np.sqrt(max(spread[0, 0], spread[1, 1])) > sd[0] or np.sqrt(spread[2, 2]) > sd[1]:
         return None
     gain = -turn @ covariance @ by[kept].T
     whose = np.concatenate([clues.anchor, clues.anchor])[_told(clues)][kept]
     moved = {who: gain @ (by_other[kept] * (whose == who)[:, None]) for who in np.unique(whose[whose >= 0]).tolist()}
     return Placed(_at(found, now), spread, moved)
+
+
+def _cost(clues: Clues, frame: Floats) -> float:
+    """Return the sum of squared misses; where errors may be shared, so much of those of one pair counts once."""
+    missed = _residuals(clues, frame)
+    square, new = np.minimum(missed.residual**2, LIMIT**2), missed.new
+    if clues.shared is None:
+        return float(np.sum(square))
+    _, place, count = np.unique(_kinds(clues), return_inverse=True, return_counts=True)
+    return float(np.sum(square * (new + (1.0 - new) / count[place])))
+
+
+def _bounded(clues: Clues, shared: Shared, frame: Floats, kept: NDArray[np.bool_], gain: Floats) -> Floats:
+    """Return the covariance (3, 3) of a place by clues that share errors.
+
+    ``gain`` (3, k) says what whitened misses make of the place. Half of noise lasts for all clues of a pair, and
+    errors of odometry for all clues. What others, and ways untold, make of the place may be shared to any degree: the
+    sum's covariance is no larger than that of each, 1/ω times as large, if Σ ω = 1 (covariance intersection); here ω
+    goes with their deviations.
+    """
+    missed = _residuals(clues, frame)
+    m, turn = len(clues.range_m), _turn(frame)
+    row = np.tile(np.arange(m), 2)[_told(clues)][kept]
+    by_other, by_own, new = missed.by_other[kept], missed.by_own[kept] @ turn, missed.new[kept]
+    parts: list[Floats] = []
+    for k in np.unique(row).tolist():
+        some = row == k
+        alike = by_other[some] @ shared.spread[k] @ by_other[some].T + by_own[some] @ shared.stray[k] @ by_own[some].T
+        parts.append(gain[:, some] @ alike @ gain[:, some].T)
+    scale = np.sqrt([np.trace(part) for part in parts])
+    bound = np.sum([part * scale.sum() / max(one, 1e-12) for part, one in zip(parts, scale, strict=True)], axis=0)
+    by_odometry = gain @ np.einsum("ki,kiq->kq", by_own, shared.astray[row])
+    lasting = np.sqrt(BEGIN_SHARE / (1.0 - BEGIN_SHARE) * new)
+    which = _kinds(clues)[kept]
+    by_views = np.column_stack([gain[:, which == one] @ lasting[which == one] for one in np.unique(which)])
+    return bound + gain @ (new[:, None] * gain.T) + by_odometry @ by_odometry.T + by_views @ by_views.T
+
+
+def _kinds(clues: Clues) -> NDArray[np.int64]:
+    """Return numbers (k,) of what is measured of whom: ranges and bearings of each pair."""
+    return np.concatenate([clues.pair, -1 - clues.pair])[_told(clues)]
+
+
+def _turn(frame: Floats) -> Floats:
+    """Return what turns poses (3,) of the robot's own frame into the site's directions."""
+    cos, sin = np.cos(frame[2]), np.sin(frame[2])
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _doubt(clues: Clues, now: Floats) -> Floats:
@@ -166,7 +245,8 @@ def _starts(clues: Clues) -> list[Floats]:
 
 def _settle(clues: Clues, frame: Floats) -> Floats:
     for _ in range(STEPS):
-        residual, by, _ = _residuals(clues, frame)
+        missed = _residuals(clues, frame)
+        residual, by = missed.residual, missed.by
         weight = 1.0 / (1.0 + (residual / LIMIT) ** 2) ** 2  # Geman and McClure 1987
         normal = by.T @ (weight[:, None] * by) + 1e-6 * np.eye(3)
         step = -np.linalg.solve(normal, by.T @ (weight * residual))
@@ -178,8 +258,28 @@ def _settle(clues: Clues, frame: Floats) -> Floats:
     return frame
 
 
-def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
-    """Whitened misses (k,) of ranges, then bearings, and their derivatives (k, 3) by the frame and by the other end."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Missed:
+    """What clues miss by: all ranges that were measured, then all bearings, k in all.
+
+    Attributes
+    ----------
+    residual : float64 (k,)
+        Misses over their deviations.
+    by, by_other, by_own : float64 (k, 3)
+        Their derivatives by the frame, by the other end, and by the robot's own pose then.
+    new : float64 (k,)
+        What share of their variances is new each time.
+    """
+
+    residual: Floats
+    by: Floats
+    by_other: Floats
+    by_own: Floats
+    new: Floats
+
+
+def _residuals(clues: Clues, frame: Floats) -> _Missed:
     cos, sin = np.cos(frame[2]), np.sin(frame[2])
     ox, oy = clues.own[:, 0], clues.own[:, 1]
     yaw = frame[2] + clues.own[:, 2]
@@ -190,8 +290,7 @@ def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
     flat = np.maximum(dx**2 + dy**2, 1e-6)
     r = np.sqrt(flat + clues.arm[:, 2] ** 2)
     m = len(r)
-    doubt = np.zeros((m, 2)) if clues.doubt is None else clues.doubt
-    range_sd = np.sqrt(BEGIN_SD_M**2 + (SCALE_SD * np.nan_to_num(clues.range_m)) ** 2 + doubt[:, 0] ** 2)
+    range_new = BEGIN_SD_M**2 + (SCALE_SD * np.nan_to_num(clues.range_m)) ** 2
     by_place = np.column_stack([-dx / r, -dy / r])  # of r, by the robot's place
     range_by = np.column_stack([by_place, -by_place[:, 0] * from_y + by_place[:, 1] * from_x])
     range_other = np.column_stack([-by_place, np.zeros(m)])
@@ -209,11 +308,29 @@ def _residuals(clues: Clues, frame: Floats) -> tuple[Floats, Floats, Floats]:
         bearing_by[c] = [0.0, 0.0, 1.0]
         bearing_other[c] = 0.0
     off = off - 2 * np.pi * np.round(off / (2 * np.pi))
-    bearing_sd = np.hypot(
-        np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD), doubt[:, 1] + doubt[:, 0] / np.sqrt(flat)
-    )
+    bearing_new = np.where(clues.compass, COMPASS_SD_RAD, BEARING_SD_RAD) ** 2
+    by, other = np.vstack([range_by, bearing_by]), np.vstack([range_other, bearing_other])
+    own = by.copy()
+    own[:m, 2], own[m:, 2] = 0.0, np.where(clues.compass, 1.0, -1.0 * clues.listens)
+    noise = np.concatenate([range_new, bearing_new])
+    if clues.shared is None:
+        way, turned = (np.zeros(m), np.zeros(m)) if clues.doubt is None else clues.doubt.T
+        variance = noise + np.concatenate([way, turned + way / np.sqrt(flat)]) ** 2
+    else:
+        errors, turn = clues.shared, _turn(frame)
+        ways = turn @ (errors.astray @ errors.astray.transpose(0, 2, 1) + errors.stray) @ turn.T
+        variance = (
+            noise + _along(own, np.vstack([ways, ways])) + _along(other, np.vstack([errors.spread, errors.spread]))
+        )
+    sd = np.sqrt(variance)
+    residual = np.concatenate([r - clues.range_m, off]) / sd
+    new = (1.0 - BEGIN_SHARE) * noise / sd**2
     told = _told(clues)
-    residual = np.concatenate([(r - clues.range_m) / range_sd, off / bearing_sd])
-    by = np.vstack([range_by / range_sd[:, None], bearing_by / bearing_sd[:, None]])
-    other = np.vstack([range_other / range_sd[:, None], bearing_other / bearing_sd[:, None]])
-    return residual[told], by[told], other[told]
+    return _Missed(
+        residual[told], (by / sd[:, None])[told], (other / sd[:, None])[told], (own / sd[:, None])[told], new[told]
+    )
+
+
+def _along(rows: Floats, spread: Floats) -> Floats:
+    """Return the variances (m,) of m rows (m, 3) of as many errors of covariance (m, 3, 3)."""
+    return np.einsum("ki,kij,kj->k", rows, spread, rows)
