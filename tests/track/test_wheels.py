@@ -28,12 +28,14 @@ SITE = make_site(HALL, level_m=1.1)
 ARM = np.array([0.3, -0.2])
 
 
-def test_an_arc_is_the_textbook_update_by_numerical_derivatives(rng: np.random.Generator) -> None:
-    n = SIZE + 5 + 2
+def test_an_arc_moves_a_belief_as_its_numerical_derivatives_say(rng: np.random.Generator) -> None:
+    n, own = SIZE + 5 + 2, [0, 1, 3, 4, 5, 7]
     for _ in range(10):
         half = 0.02 * rng.standard_normal((n, n))
         mean, covariance = 0.05 * rng.standard_normal(n), half @ half.T
         way, turn, dt = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), 0.1
+        speed, rate = rng.uniform(-3, 3), rng.uniform(-3, 3)
+        mean[[0, 1, 3]] += 0.3 * rng.standard_normal(3)  # nothing that was believed of these has a say
 
         # of all headings that it may have set out on, the mean
         shorter = np.exp(-covariance[SLOT + 2, SLOT + 2] / 2)
@@ -41,30 +43,44 @@ def test_an_arc_is_the_textbook_update_by_numerical_derivatives(rng: np.random.G
         def turned(yaw: float) -> Floats:
             return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ ARM
 
-        def disagreement(
-            x: Floats, way: float = way, turn: float = turn, dt: float = dt, shorter: float = shorter
-        ) -> Floats:
-            # the origin drives the arc in a thousand short pieces; the arm turns with it
+        def driven(
+            x: Floats, way: float = shorter * way, turn: float = turn, dt: float = dt,
+            speed: float = shorter * speed, rate: float = rate,
+        ) -> Floats:  # fmt: skip
+            # the origin drives the arc in a thousand short pieces; the arm turns with it; the last n are noise
             pieces = 1000
-            rate = (turn - x[SLOT + 4] * dt) / pieces
-            yaw = x[SLOT + 2] + rate * (np.arange(pieces) + 0.5)
-            step = shorter * way * (1 - x[SLOT + 3]) / pieces
-            driven = np.array([np.sum(step * np.cos(yaw)), np.sum(step * np.sin(yaw))])
-            place = x[0:2] - x[SLOT : SLOT + 2] - driven - turned(x[3]) + turned(x[SLOT + 2])
-            return np.append(place, x[3] - x[SLOT + 2] - pieces * rate)
+            ahead = (turn - x[SLOT + 4] * dt) / pieces
+            yaw = x[SLOT + 2] + ahead * (np.arange(pieces) + 0.5)
+            step = way * (1 - x[SLOT + 3]) / pieces
+            end = x[SLOT + 2] + pieces * ahead + x[n + 2]
+            place = x[SLOT : SLOT + 2] + [np.sum(step * np.cos(yaw)), np.sum(step * np.sin(yaw))]
+            place = place + turned(end) - turned(x[SLOT + 2]) + x[n : n + 2]
+            turns, goes = rate - x[SLOT + 4] + x[n + 5], speed * (1 - x[SLOT + 3])
+            swung = turned(end)
+            left = turns * np.array([-swung[1], swung[0]])
+            moves = goes * np.array([np.cos(end), np.sin(end)]) + left + x[n + 3 : n + 5]
+            return np.array([*place, end, *moves, turns])
 
-        h = np.array([approx_fprime(mean, lambda x, i=i: disagreement(x)[i], 1e-7) for i in range(3)])
-        strays = wheels.CREEP_PSD * dt + wheels.SLIP_M * abs(way)
-        twists = wheels.TWIST_PSD * dt + wheels.TWIST_M * abs(way) + wheels.TWIST_RAD * abs(turn)
-        s = h @ covariance @ h.T + np.diag([strays, strays, twists])
-        if disagreement(mean) @ np.linalg.solve(s, disagreement(mean)) > wheels.UNLIKELY:
-            continue
-        gain = covariance @ h.T @ np.linalg.inv(s)
-        got, after = mean.copy(), covariance.copy()
-        wheels.take(got, after, np.ones(n, bool), 0, SLOT, (way, turn, dt, 0.0), ARM)
-        np.testing.assert_allclose(got[:8], (mean - gain @ disagreement(mean))[:8], atol=3e-5)
-        np.testing.assert_allclose(after[:8, :8], ((np.eye(n) - gain @ h) @ covariance)[:8, :8], atol=3e-5)
-        np.testing.assert_array_equal(got[SLOT : SLOT + 3], got[[0, 1, 3]])
+        strays = wheels.CREEP_PSD * dt + wheels.SLIP_M * abs(way) * shorter
+        twists = wheels.TWIST_PSD * dt + wheels.TWIST_M * abs(way) * shorter + wheels.TWIST_RAD * abs(turn)
+        uneven = (wheels.CREEP_PSD + wheels.SLIP_M * abs(speed) * shorter) / wheels.EVEN_S
+        unsteady = wheels.TWIST_PSD + wheels.TWIST_M * abs(speed) * shorter + wheels.TWIST_RAD * abs(rate)
+        noise = np.diag([strays, strays, twists, uneven, uneven, unsteady / wheels.EVEN_S])
+        x = np.append(mean, np.zeros(6))
+        by = np.array([approx_fprime(x, lambda x, i=i: driven(x)[i], 1e-7) for i in range(6)])
+        carry, expected = np.eye(n), mean.copy()
+        carry[own], expected[own] = by[:, :n], driven(x)
+        after = carry @ covariance @ carry.T
+        after[np.ix_(own, own)] += by[:, n:] @ noise @ by[:, n:].T
+        got, spread = mean.copy(), covariance.copy()
+        spread[own, own] += 1.0  # as of a vehicle of which only its odometry tells
+        wheels.take(got, spread, np.ones(n, bool), 0, SLOT, np.array([way, turn, dt, 0.0, speed, rate]), ARM)
+        # the anchor is where the vehicle is now
+        expected[SLOT : SLOT + 3] = expected[[0, 1, 3]]
+        move = np.eye(n)
+        move[[SLOT, SLOT + 1, SLOT + 2]] = move[[0, 1, 3]]
+        np.testing.assert_allclose(got, expected, atol=2e-6)
+        np.testing.assert_allclose(spread, move @ after @ move.T, atol=1e-5)
 
 
 def odometry(rows: Floats) -> Table:

@@ -218,7 +218,7 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
             if step >= 0:
                 steps.wander(mean, covariance, vehicle, step, until_s - now_s, bool(belief.placed[vehicle]))
             if wheel >= 0:
-                wheels.wander(covariance, free, vehicle, wheel, until_s - now_s, belief.roughness(vehicle))
+                wheels.wander(covariance, wheel, until_s - now_s, belief.roughness(vehicle))
             if inputs.gyro_slot[vehicle] >= 0:
                 gyro.wander(covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), until_s - now_s)
         if belief.trust is not None:
@@ -244,14 +244,13 @@ def _sense(
     inputs = belief.inputs
     assert inputs is not None
     vehicle = int(inputs.vehicle[row])
-    first, second, third, fourth = inputs.value[row].tolist()
+    first, second = inputs.value[row, :2].tolist()
     if inputs.kind[row] == STEP:
         steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second, about)
     elif inputs.kind[row] == WHEELS:
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
-        wheels.take(
-            mean, covariance, free, vehicle, slot, (first, second, third, fourth), arm, about, belief.roughness(vehicle)
-        )
+        lone, rough = bool(inputs.gyro_slot[vehicle] < 0), belief.roughness(vehicle)
+        wheels.take(mean, covariance, free, vehicle, slot, inputs.value[row], arm, about, rough, lone)
     elif inputs.kind[row] == GYRO:
         gyro.take(mean, covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), first, second)
     else:

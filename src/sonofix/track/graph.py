@@ -19,7 +19,7 @@ from sonofix.records import Estimate, Floats
 from sonofix.track import steps, wheels
 from sonofix.track.belief import SIZE, Belief, predict
 from sonofix.track.follow import SLIPPED_M, Follower
-from sonofix.track.inputs import COMPASS, STEP
+from sonofix.track.inputs import COMPASS, STEP, WHEELS
 from sonofix.track.passage import YAW, Heard, Mark, Passage
 from sonofix.track.smooth import PASSES, settle, track
 from sonofix.track.update import expect, noise_of, pairs_of
@@ -35,6 +35,9 @@ BEYOND = 0.001
 
 REOPENED_MPS = 1.0
 """Deviation of a pushed vehicle's velocity, as `belief.reopen` has it."""
+
+DRIVEN = tuple(POSE.index(name) for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate"))
+"""What a row of odometry tells of a vehicle."""
 
 ITERATIONS = 30
 
@@ -125,6 +128,7 @@ class Problem:
             self.values.insert(k, belief.mean[index] / unit)
             self._zero.insert(k, np.zeros(len(node.index)))
         self._begun: dict[tuple[int, int], int] = {}
+        self._driven: dict[int, Floats] = {}
         self._unseen: dict[int, float] = {}
         self._fresh(0, self.nodes[0].index)
         self._told(0)
@@ -191,8 +195,11 @@ class Problem:
         pose = np.repeat(anew, SIZE)
         cut = np.zeros(len(node.belief.mean), bool)
         cut[: len(pose)] = pose
+        self._driven = self._believed(k, anew)
+        driven = [SIZE * who + i for who in self._driven for i in DRIVEN]
         kept = np.array([s for s in node.index if s in set(before.index.tolist()) and not cut[s]], np.int64)
-        self._fresh(k, np.setdiff1d(node.index, kept))
+        kept = np.setdiff1d(kept, driven)
+        self._fresh(k, np.setdiff1d(np.setdiff1d(node.index, kept), driven))
         if len(kept):
             known = np.setdiff1d(np.arange(len(step)), before.index)
             constant = step[np.ix_(kept, known)] @ before.belief.mean[known]
@@ -246,7 +253,7 @@ class Problem:
             return
         for row in node.mark.rows:
             kind, who = int(inputs.kind[row]), int(inputs.vehicle[row])
-            first, second, third, fourth = inputs.value[row].tolist()
+            first, second, _, fourth = inputs.value[row, :4].tolist()
             if kind == COMPASS:
                 self._point(k, who, first)
                 continue
@@ -256,8 +263,8 @@ class Problem:
                 if begun is not None and np.isfinite(first) and np.isfinite(second):
                     self._chord(k, begun, who, first, second)
                 continue
-            if begun is not None and np.all(np.isfinite([first, second, third])) and 0.0 < third <= wheels.LONGEST_S:
-                self._arc(k, begun, who, (first, second, third))
+            if begun is not None and who in self._driven:
+                self._drive(k, begun, who, self._driven[who])
             if fourth > 0:
                 # what turns unseen does so after this knot: no arc begins here
                 self._unseen[who] = fourth
@@ -289,17 +296,48 @@ class Problem:
 
         self._difference(k, begun, (SIZE * who, SIZE * who + 1), (slot, slot + 1), measure)
 
-    def _arc(self, k: int, begun: int, who: int, arc: tuple[float, float, float]) -> None:
-        inputs = self._passage.follower.belief.inputs
+    def _believed(self, k: int, anew: NDArray[np.bool_]) -> dict[int, Floats]:
+        """Return what odometry told by a node of vehicles that it carries there: as in the filter, and nothing else."""
+        node, inputs = self.nodes[k], self._passage.follower.belief.inputs
+        driven: dict[int, Floats] = {}
+        for row in node.mark.rows if inputs is not None and node.belief.heeded else ():
+            assert inputs is not None
+            who, told = int(inputs.vehicle[row]), inputs.value[row]
+            begun, at = self._begun.get((WHEELS, who)), SIZE * who
+            if inputs.kind[row] != WHEELS or begun is None or anew[who] or not np.isfinite(told).all():
+                continue
+            start, pose = self.nodes[begun], (at, at + 1, at + YAW)
+            if node.at(*pose) is None or start.at(*pose) is None or not 0.0 < told[2] <= wheels.LONGEST_S:
+                continue
+            slot = int(inputs.wheel_slot[who])
+            state = node.whole(self.values.atVector(k))
+            state[slot : slot + 3] = start.whole(self.values.atVector(begun))[list(pose)]
+            arc, rough = (float(told[0]), float(told[1]), float(told[2])), node.belief.roughness(who)
+            off, _, noise = wheels.measure(state, who, slot, arc, inputs.arm[who], rough)
+            # what cannot be is left out, as the filter does: a push goes on after the epoch that told of it
+            if off @ np.linalg.solve(noise, off) <= wheels.UNLIKELY:
+                driven[who] = told
+        return driven
+
+    def _drive(self, k: int, begun: int, who: int, told: Floats) -> None:
+        """Let an arc lead to a node, and what is told next say how it goes on from there."""
+        inputs, node, at = self._passage.follower.belief.inputs, self.nodes[k], SIZE * who
         assert inputs is not None
-        slot, arm = int(inputs.wheel_slot[who]), inputs.arm[who]
+        slot, arm, rough = int(inputs.wheel_slot[who]), inputs.arm[who], node.belief.roughness(who)
+        way, turn, dt, _, speed, rate = told.tolist()
 
         def measure(state: Floats) -> tuple[Floats, Floats, Floats]:
-            return wheels.measure(state, who, slot, arc, arm)
+            return wheels.measure(state, who, slot, (way, turn, dt), arm, rough)
 
-        at = SIZE * who
-        if self.nodes[k].at(at + YAW) is not None:
-            self._difference(k, begun, (at, at + 1, at + YAW), (slot, slot + 1, slot + 2), measure)
+        def miss(_factor: Any, values: Any, jacobians: Any) -> Floats:
+            off, derivative, _ = wheels.going(node.whole(values.atVector(k)), who, slot, (speed, rate), arm, rough)
+            if jacobians is not None:
+                jacobians[0] = node.by(derivative)
+            return -off
+
+        self._difference(k, begun, (at, at + 1, at + YAW), (slot, slot + 1, slot + 2), measure)
+        noise = wheels.going(node.whole(self.values.atVector(k)), who, slot, (speed, rate), arm, rough)[2]
+        self.graph.add(self._gtsam.CustomFactor(self._robust(noise), [k], miss))
 
     def _difference(
         self,
@@ -341,7 +379,7 @@ def _transition(passage: Passage, belief: Belief, until_s: float) -> tuple[Float
     n, inputs = len(belief.mean), belief.inputs
     if inputs is not None:
         none = np.zeros(0, np.int64)
-        inputs = replace(inputs, time_s=np.zeros(0), kind=none, vehicle=none, value=np.zeros((0, 4)))
+        inputs = replace(inputs, time_s=np.zeros(0), kind=none, vehicle=none, value=np.zeros((0, 6)))
     covariance = np.zeros((2 * n, 2 * n))
     own, copy = np.r_[0 : n - 2, 2 * n - 2 : 2 * n], np.arange(n - 2, 2 * n - 2)
     covariance[own, copy] = covariance[copy, own] = 1.0

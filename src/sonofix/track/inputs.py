@@ -39,9 +39,10 @@ class Inputs:
         When each row is known: a step at its end, a row of odometry when the next one comes.
     kind, vehicle : int (k,)
         `STEP`, `WHEELS`, `COMPASS` or `GYRO`; index of the vehicle it speaks of.
-    value : float64 (k, 4)
-        Length and heading of a step; way, turn and time of an arc by odometry, and what may have been turned unseen at
-        its end; heading of a compass; turn by a gyro and its time. NaN where unknown.
+    value : float64 (k, 6)
+        Length and heading of a step; way, turn and time of an arc by odometry, what may have been turned unseen at its
+        end, and speed and yaw rate that hold from there on; heading of a compass; turn by a gyro and its time. NaN
+        where unknown.
     step_slot, wheel_slot : int (V,)
         Where each vehicle's `STEP_STATES` and `WHEEL_STATES` stand in a belief; −1: it has none.
     gyro_slot : int (V,)
@@ -123,7 +124,7 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
         if stated is None and not pairs:
             return None
         none = np.zeros(0, np.int64)
-        parts.append((np.zeros(0), none, none, np.zeros((0, 4))))
+        parts.append((np.zeros(0), none, none, np.zeros((0, 6))))
     time_s, kinds, vehicle, value = (np.concatenate(p) for p in zip(*parts, strict=True))
     order = np.argsort(time_s, kind="stable")
     # only a compass tells what odometry did not see, if no gyro saw it; without one the doubt would stay
@@ -162,12 +163,12 @@ def gather(site: Site, tables: Mapping[str, Table], stated: Iterable[tuple[str, 
 
 
 def _values(kind: int, own: Mapping[str, Floats]) -> tuple[Floats, Floats]:
-    """Times (k,) and rows (k, 4) of one vehicle as `Inputs` has them."""
+    """Times (k,) and rows (k, 6) of one vehicle as `Inputs` has them."""
     time_s = own["time_s"]
     if kind == GYRO:
         time_s, turn, dt = summed(time_s, own["gz_radps"])
-        return time_s, np.column_stack([turn, dt, np.full((len(time_s), 2), np.nan)])
-    out = np.full((len(time_s), 4), np.nan)
+        return time_s, np.column_stack([turn, dt, np.full((len(time_s), 4), np.nan)])
+    out = np.full((len(time_s), 6), np.nan)
     if kind == STEP:
         out[:, 0], out[:, 1] = own["length_m"], own["heading_rad"]
     elif kind == COMPASS:
@@ -179,4 +180,5 @@ def _values(kind: int, own: Mapping[str, Floats]) -> tuple[Floats, Floats]:
         slow = np.abs(own["v_mps"]) < STANDING_MPS
         out[1:, 3] = np.where(slow[:-1] & ~slow[1:], UNSEEN_RAD, 0.0)
         out[0, 3] = 0.0
+        out[:-1, 4], out[:-1, 5] = own["v_mps"][:-1], own["yaw_rate_radps"][:-1]
     return time_s, out

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE
 from sonofix.records import Floats
-from sonofix.track.anchor import correct, free_turns, open_errors
+from sonofix.track.anchor import correct, open_errors
 
 SCALE_SD = 0.05
 """Of the share of itself by which a speed is told too high; it stays what it is."""
@@ -52,6 +52,12 @@ LONGEST_S = 2.0
 UNLIKELY = 40.0
 """Squared distance, over its variance, of an arc that is not believed."""
 
+AGILE_PSD = 2.0
+"""White acceleration in m²/s³ of which a vehicle may be capable whose arc is believed."""
+
+EVEN_S = 0.2
+"""Speeds of so long apart stray from odometry each by itself."""
+
 COMPASS_SD_RAD = 0.05
 """Of one reading; steel nearby is the rest, which `ROBUST` bounds."""
 
@@ -68,14 +74,11 @@ def begin(covariance: Floats, free: NDArray[np.bool_], slot: int) -> None:
     open_errors(covariance, free, slot + 3, (SCALE_SD, BIAS_SD_RADPS))
 
 
-def wander(
-    covariance: Floats, free: NDArray[np.bool_], vehicle: int, slot: int, dt: float, rough: Floats = AS_EXPECTED
-) -> None:
-    """Let the errors of odometry wander for ``dt``, in place, and its turns be as free as rows may tell."""
+def wander(covariance: Floats, slot: int, dt: float, rough: Floats = AS_EXPECTED) -> None:
+    """Let the errors of odometry wander for ``dt``, in place."""
     span = abs(dt) * float(rough[2])
     covariance[slot + 3, slot + 3] += SCALE_PSD * span
     covariance[slot + 4, slot + 4] += BIAS_PSD * span
-    free_turns(covariance, free, vehicle, dt)
 
 
 def take(
@@ -84,34 +87,79 @@ def take(
     free: NDArray[np.bool_],
     vehicle: int,
     slot: int,
-    arc: tuple[float, float, float, float],
+    told: Floats,
     arm: Floats,
     about: Floats | None = None,
     rough: Floats = AS_EXPECTED,
+    lone: bool = True,
 ) -> None:
-    """Correct a belief at the end of an arc, in place, and put the anchor there.
+    """Put a vehicle, in place, where an arc leads from its anchor, and the anchor there, and let it go on as told next.
 
-    ``arc`` is way, turn, time, and what it may have turned unseen at their end; ``arm`` (2,) is where the motion is
-    followed, from the vehicle's origin. The arc is linearised at ``about``, or else at the mean. One that took no time
-    (a row that stands there twice) tells nothing.
+    What velocity was believed has no say in it: an arc that were averaged with it would be drawn straight in every
+    bend, and by its own noise tell that wheels read too much (errors in variables). It only judges whether the arc can
+    be. The same of the heading where odometry is the ``lone`` sensor of turns; else arc and heading correct each other.
+
+    ``told`` (6,) is way, turn, time, what may have been turned unseen at their end, and the speed and yaw rate that
+    hold from there on; ``arm`` (2,) is where the motion is followed, from the vehicle's origin. The arc is linearised
+    at ``about``, or else at the mean. One that took no time (a row that stands there twice) tells nothing.
     """
     at = SIZE * vehicle
-    way, turn, dt, unseen = arc
-    if free[slot] and free[slot + 2] and np.all(np.isfinite(arc)) and 0.0 < dt <= LONGEST_S:
-        if about is None:
-            # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
-            way *= float(np.exp(-covariance[slot + 2, slot + 2] / 2))
-            about = mean
-        miss, derivative, noise = measure(about, vehicle, slot, (way, turn, dt), arm, rough)
-        correct(mean, covariance, miss - derivative @ (mean - about), derivative, noise, UNLIKELY)
+    way, turn, dt, unseen, speed, rate = told.tolist()
+    drives = free[slot] and free[slot + 2] and np.all(np.isfinite(told[:4])) and 0.0 < dt <= LONGEST_S
+    # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
+    shorter = 1.0 if about is not None else float(np.exp(-covariance[slot + 2, slot + 2] / 2))
+
+    def here() -> Floats:
+        return mean.copy() if about is None else about
+
+    if drives:
+        arc = (shorter * way, turn, dt)
+        miss, derivative, noise = measure(here(), vehicle, slot, arc, arm, rough)
+        off = miss - derivative @ (mean - here())
+        expected = derivative @ covariance @ derivative.T + noise
+        expected[:2, :2] += AGILE_PSD * dt**3 / 3 * np.eye(2)
+        if off @ np.linalg.solve(expected, off) <= UNLIKELY:
+            if lone:
+                _put(mean, covariance, slice(at + 3, at + 4), here(), miss[2:], derivative[2:], noise[2:, 2:])
+            else:
+                correct(mean, covariance, off[2:], derivative[2:], noise[2:, 2:], np.inf)
+            miss, derivative, _ = measure(here(), vehicle, slot, arc, arm, rough)
+            _put(mean, covariance, slice(at, at + 2), here(), miss[:2], derivative[:2], noise[:2, :2])
+        else:
+            # one of the two is wrong
+            covariance[[at, at + 1, at + 3], [at, at + 1, at + 3]] += off**2
     if free[at + 3]:
         covariance[at + 3, at + 3] += unseen**2
+        if np.isfinite(speed) and np.isfinite(rate) and dt != 0.0:
+            goes = (shorter * speed, rate)
+            if lone:
+                miss, derivative, noise = going(here(), vehicle, slot, goes, arm, rough)
+                _put(mean, covariance, slice(at + 7, at + 8), here(), miss[2:], derivative[2:], noise[2:, 2:])
+            miss, derivative, noise = going(here(), vehicle, slot, goes, arm, rough)
+            _put(mean, covariance, slice(at + 4, at + 6), here(), miss[:2], derivative[:2], noise[:2, :2])
     for own, of in ((slice(slot, slot + 2), slice(at, at + 2)), (slot + 2, at + 3)):
         mean[own] = mean[of]
         covariance[own, :] = covariance[of, :]
         covariance[:, own] = covariance[:, of]
     free[slot : slot + 2] = True
     free[slot + 2] = free[at + 3]
+
+
+def _put(
+    mean: Floats, covariance: Floats, own: slice, about: Floats, miss: Floats, derivative: Floats, noise: Floats
+) -> None:
+    """Make states what others tell of them, in place, whatever was believed of them.
+
+    ``miss`` (k,) is what they lack at ``about`` and ``derivative`` (k, n) that of what is told there, 1 by themselves.
+    """
+    by = -derivative
+    by[:, own] = 0.0
+    to = about[own] + miss + by @ (mean - about)
+    crossed = by @ covariance
+    mean[own] = to
+    covariance[own, :] = crossed
+    covariance[:, own] = crossed.T
+    covariance[own, own] = crossed @ by.T + noise
 
 
 def measure(
@@ -150,6 +198,30 @@ def measure(
     place = CREEP_PSD * dt + SLIP_M * abs(way)
     heading = TWIST_PSD * dt + TWIST_M * abs(way) + TWIST_RAD * abs(turn)
     return miss, derivative, np.diag([rough[0] * place, rough[0] * place, rough[1] * heading])
+
+
+def going(
+    about: Floats, vehicle: int, slot: int, told: tuple[float, float], arm: Floats, rough: Floats = AS_EXPECTED
+) -> tuple[Floats, Floats, Floats]:
+    """Return by how much speed and yaw rate that are told miss a state (3,), what they measure there, and covariance.
+
+    v = (1 − k) speed u(ψ) + ω R(ψ) J arm in x and y, J a quarter turn to the left, and ω = yaw rate − b.
+    """
+    at, (speed, rate) = SIZE * vehicle, told
+    along = np.array([np.cos(about[at + 3]), np.sin(about[at + 3])])
+    across = np.array([-along[1], along[0]])
+    out = arm[0] * along + arm[1] * across
+    left = np.array([-out[1], out[0]])
+    goes, turns = (1.0 - about[slot + 3]) * speed, about[at + 7]
+    miss = np.append(goes * along + turns * left - about[at + 4 : at + 6], rate - about[slot + 4] - turns)
+    derivative = np.zeros((3, len(about)))
+    derivative[0, at + 4] = derivative[1, at + 5] = derivative[2, at + 7] = 1.0
+    derivative[:2, at + 3], derivative[:2, at + 7] = turns * out - goes * across, -left
+    derivative[:2, slot + 3] = speed * along
+    derivative[2, slot + 4] = 1.0
+    uneven = CREEP_PSD + SLIP_M * abs(speed)
+    twist = TWIST_PSD + TWIST_M * abs(speed) + TWIST_RAD * abs(rate)
+    return miss, derivative, np.diag([rough[0] * uneven, rough[0] * uneven, rough[1] * twist]) / EVEN_S
 
 
 def point(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int, heading_rad: float) -> None:
