@@ -52,8 +52,8 @@ LONGEST_S = 2.0
 UNLIKELY = 40.0
 """Squared distance, over its variance, of an arc that is not believed."""
 
-AGILE_PSD = 2.0
-"""White acceleration in m²/s³ of which a vehicle may be capable whose arc is believed."""
+AGILE_PSD = 0.5
+"""White acceleration in m²/s³ between two rows, beyond which speed is not believed to have changed so suddenly."""
 
 EVEN_S = 0.2
 """Speeds of so long apart stray from odometry each by itself."""
@@ -105,44 +105,76 @@ def take(
     """
     at = SIZE * vehicle
     way, turn, dt, unseen, speed, rate = told.tolist()
-    drives = free[slot] and free[slot + 2] and np.all(np.isfinite(told[:4])) and 0.0 < dt <= LONGEST_S
     # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
     shorter = 1.0 if about is not None else float(np.exp(-covariance[slot + 2, slot + 2] / 2))
-
-    def here() -> Floats:
-        return mean.copy() if about is None else about
-
+    belief = (mean, covariance, vehicle, slot)
+    drives = free[slot] and free[slot + 2] and np.all(np.isfinite(told[:4])) and 0.0 < dt <= LONGEST_S
     if drives:
-        arc = (shorter * way, turn, dt)
-        miss, derivative, noise = measure(here(), vehicle, slot, arc, arm, rough)
-        off = miss - derivative @ (mean - here())
-        expected = derivative @ covariance @ derivative.T + noise
-        expected[:2, :2] += AGILE_PSD * dt**3 / 3 * np.eye(2)
-        if off @ np.linalg.solve(expected, off) <= UNLIKELY:
-            if lone:
-                _put(mean, covariance, slice(at + 3, at + 4), here(), miss[2:], derivative[2:], noise[2:, 2:])
-            else:
-                correct(mean, covariance, off[2:], derivative[2:], noise[2:, 2:], np.inf)
-            miss, derivative, _ = measure(here(), vehicle, slot, arc, arm, rough)
-            _put(mean, covariance, slice(at, at + 2), here(), miss[:2], derivative[:2], noise[:2, :2])
-        else:
-            # one of the two is wrong
-            covariance[[at, at + 1, at + 3], [at, at + 1, at + 3]] += off**2
+        _drive(belief, (shorter * way, turn, dt), arm, about, rough, lone)
     if free[at + 3]:
         covariance[at + 3, at + 3] += unseen**2
         if np.isfinite(speed) and np.isfinite(rate) and dt != 0.0:
-            goes = (shorter * speed, rate)
-            if lone:
-                miss, derivative, noise = going(here(), vehicle, slot, goes, arm, rough)
-                _put(mean, covariance, slice(at + 7, at + 8), here(), miss[2:], derivative[2:], noise[2:, 2:])
-            miss, derivative, noise = going(here(), vehicle, slot, goes, arm, rough)
-            _put(mean, covariance, slice(at + 4, at + 6), here(), miss[:2], derivative[:2], noise[:2, :2])
+            _go_on(belief, (shorter * speed, rate), dt if drives else np.inf, arm, about, rough, lone)
     for own, of in ((slice(slot, slot + 2), slice(at, at + 2)), (slot + 2, at + 3)):
         mean[own] = mean[of]
         covariance[own, :] = covariance[of, :]
         covariance[:, own] = covariance[:, of]
     free[slot : slot + 2] = True
     free[slot + 2] = free[at + 3]
+
+
+def _drive(
+    belief: tuple[Floats, Floats, int, int],
+    arc: tuple[float, float, float],
+    arm: Floats,
+    about: Floats | None,
+    rough: Floats,
+    lone: bool,
+) -> None:
+    """Put a vehicle, in place, where an arc leads from its anchor; open its place where the arc cannot be."""
+    mean, covariance, vehicle, slot = belief
+    at = SIZE * vehicle
+    here = mean.copy() if about is None else about
+    miss, derivative, noise = measure(here, vehicle, slot, arc, arm, rough)
+    off = miss - derivative @ (mean - here)
+    if off @ np.linalg.solve(derivative @ covariance @ derivative.T + noise, off) > UNLIKELY:
+        # one of the two is wrong
+        covariance[[at, at + 1, at + 3], [at, at + 1, at + 3]] += off**2
+        return
+    if lone:
+        _put(mean, covariance, slice(at + 3, at + 4), here, miss[2:], derivative[2:], noise[2:, 2:])
+    else:
+        correct(mean, covariance, off[2:], derivative[2:], noise[2:, 2:], np.inf)
+    here = mean.copy() if about is None else about
+    miss, derivative, _ = measure(here, vehicle, slot, arc, arm, rough)
+    _put(mean, covariance, slice(at, at + 2), here, miss[:2], derivative[:2], noise[:2, :2])
+
+
+def _go_on(
+    belief: tuple[Floats, Floats, int, int],
+    told: tuple[float, float],
+    since_s: float,
+    arm: Floats,
+    about: Floats | None,
+    rough: Floats,
+    lone: bool,
+) -> None:
+    """Let a vehicle move, in place, as the row tells that holds from now on, unless it cannot be so since the last."""
+    mean, covariance, vehicle, slot = belief
+    at = SIZE * vehicle
+    here = mean.copy() if about is None else about
+    miss, derivative, noise = going(here, vehicle, slot, told, arm, rough)
+    off = (miss - derivative @ (mean - here))[:2]
+    expected = (derivative @ covariance @ derivative.T + noise)[:2, :2]
+    if np.isfinite(since_s):
+        expected += AGILE_PSD * since_s * np.eye(2)
+        if off @ np.linalg.solve(expected, off) > UNLIKELY:
+            return
+    if lone:
+        _put(mean, covariance, slice(at + 7, at + 8), here, miss[2:], derivative[2:], noise[2:, 2:])
+        here = mean.copy() if about is None else about
+        miss, derivative, _ = going(here, vehicle, slot, told, arm, rough)
+    _put(mean, covariance, slice(at + 4, at + 6), here, miss[:2], derivative[:2], noise[:2, :2])
 
 
 def _put(
