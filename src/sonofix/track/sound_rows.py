@@ -59,6 +59,8 @@ class Peak:
         Their covariance S.
     noise : float64 (m, m)
     gain : float64 (n, m)
+    settled : bool
+        Whether iterations came to it.
     """
 
     mean: Floats
@@ -67,6 +69,7 @@ class Peak:
     expected: Floats
     noise: Floats
     gain: Floats
+    settled: bool = True
 
     @property
     def cost(self) -> float:
@@ -86,7 +89,7 @@ class Peak:
         """
         expected = factor * (self.expected - self.noise) + self.noise
         cost = float(self.miss @ np.linalg.solve(expected, self.miss))
-        return cost + float(np.linalg.slogdet(expected)[1]), cost <= limit(len(self.miss))
+        return cost + float(np.linalg.slogdet(expected)[1]), self.settled and cost <= limit(len(self.miss))
 
     def covariance(self, before: Floats) -> Floats:
         """Return the state's covariance, by Joseph's form, where ``before`` was predicted."""
@@ -106,7 +109,7 @@ class Hypothesis:
 
 def odd(found: Peak) -> bool:
     """Whether rows are so unlikely together that one of them may be wrong."""
-    return found.cost > threshold(len(found.miss), ODD)
+    return not found.settled or found.cost > threshold(len(found.miss), ODD)
 
 
 def limit(count: int) -> float:
@@ -118,7 +121,7 @@ def likely(
     whole: Peak,
     count: int,
     before: Floats,
-    solve: Callable[[NDArray[np.bool_]], Peak | None],
+    solve: Callable[[NDArray[np.bool_]], Peak],
     look: Callable[[Floats], tuple[Floats, Floats, Floats]],
 ) -> list[Hypothesis]:
     """Return what may be true of rows that cannot be together, best first; nothing where no hypothesis is.
@@ -134,7 +137,7 @@ def likely(
     before : float64 (n, n)
         Covariance of what was predicted.
     solve : callable
-        Gives the peak by some rows (r,); None where there is none.
+        Gives the peak by some rows (r,).
     look : callable
         Gives of all rows at a mean: by how much ranges are too long, their derivative (r, n), their variance (r,).
     """
@@ -167,7 +170,7 @@ def mixed(hypotheses: list[Hypothesis], before: Floats) -> tuple[Floats, Floats]
 
 
 def _solved(
-    whole: Peak, count: int, out: int, solve: Callable[[NDArray[np.bool_]], Peak | None]
+    whole: Peak, count: int, out: int, solve: Callable[[NDArray[np.bool_]], Peak]
 ) -> list[tuple[NDArray[np.bool_], Peak]]:
     """Solve without each choice of ``out`` rows, likeliest first; at least one row is left."""
     if count <= out:
@@ -183,9 +186,7 @@ def _solved(
     for k in np.argsort(gains)[::-1][:TRIED]:
         kept = np.ones(count, bool)
         kept[list(choices[k])] = False
-        peak = solve(kept)
-        if peak is not None:
-            solved.append((kept, peak))
+        solved.append((kept, solve(kept)))
     return solved
 
 

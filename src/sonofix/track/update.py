@@ -106,13 +106,12 @@ def update(
     ):
         iterations = 1
     found = _peak(belief, epoch, hearing, iterations, mean, (miss, derivative, crossed))
-    if found is None:
+    if trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
+        after, used[rows[near]] = _sound(belief, epoch, hearing, iterations, mean, found)
+        return after, used, surprise
+    if not found.settled:
         used[:] = False
         return belief, used, surprise
-    if trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
-        after, kept = _sound(belief, epoch, hearing, iterations, mean, found)
-        used[rows[near]] = kept
-        return after, used, surprise
     after = replace(belief, mean=found.mean, covariance=found.covariance(belief.covariance))
     return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
 
@@ -141,8 +140,8 @@ def _peak(
     iterations: int,
     mean: Floats,
     first: tuple[Floats, Floats, Floats] | None = None,
-) -> Peak | None:
-    """Return the most likely state, iterated from ``mean``; None where it does not settle.
+) -> Peak:
+    """Return the most likely state, iterated from ``mean``.
 
     ``first`` are innovations, derivative and its product with the covariance there, if they are known.
     """
@@ -162,9 +161,8 @@ def _peak(
         mean = moved if k < WHOLE_STEPS or last < SETTLED else (mean + moved) / 2
         if last < SETTLED:
             break
-    if last > ASTRAY and iterations > 1 and belief.about is None:
-        return None
-    return Peak(mean, derivative, miss, expected, hearing.noise, gain)
+    settled = last <= ASTRAY or iterations == 1 or belief.about is not None
+    return Peak(mean, derivative, miss, expected, hearing.noise, gain, settled)
 
 
 def _sound(
@@ -176,7 +174,7 @@ def _sound(
     """
     count = len(hearing.dt)
 
-    def solve(kept: NDArray[np.bool_]) -> Peak | None:
+    def solve(kept: NDArray[np.bool_]) -> Peak:
         return _peak(belief, epoch, hearing.of(kept), iterations, mean)
 
     def look(at: Floats) -> tuple[Floats, Floats, Floats]:
@@ -189,12 +187,11 @@ def _sound(
         return replace(belief, mean=after, covariance=covariance), found[0].kept
     everything = np.ones(count, bool)
     misfit, redundancy = whole.misfit
-    if misfit > sound_rows.limit(len(whole.miss)):
+    if whole.settled and misfit > sound_rows.limit(len(whole.miss)):
         wider = replace(hearing, noise=hearing.noise * (misfit / redundancy))
-        again = _peak(belief, epoch, wider, iterations, mean)
-        if again is None:
-            return belief, ~everything
-        whole = again
+        whole = _peak(belief, epoch, wider, iterations, mean)
+    if not whole.settled:
+        return belief, ~everything
     return replace(belief, mean=whole.mean, covariance=whole.covariance(belief.covariance)), everything
 
 
