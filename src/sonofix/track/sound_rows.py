@@ -89,7 +89,7 @@ class Peak:
         """
         expected = factor * (self.expected - self.noise) + self.noise
         cost = float(self.miss @ np.linalg.solve(expected, self.miss))
-        return cost + float(np.linalg.slogdet(expected)[1]), self.settled and cost <= limit(len(self.miss))
+        return cost + float(np.linalg.slogdet(expected)[1]), cost <= limit(len(self.miss))
 
     def covariance(self, before: Floats) -> Floats:
         """Return the state's covariance, by Joseph's form, where ``before`` was predicted."""
@@ -126,7 +126,8 @@ def likely(
 ) -> list[Hypothesis]:
     """Return what may be true of rows that cannot be together, best first; nothing where no hypothesis is.
 
-    One row is wrong, or else the prediction; if neither can be, two rows, or one and the prediction.
+    One row is wrong, or else the prediction; if neither can be, two rows, or one and the prediction. A hypothesis whose
+    state did not settle is among them where it is not ruled out.
 
     Parameters
     ----------

@@ -181,11 +181,13 @@ def _sound(
         shown, derivative = expect(hearing.links, belief, at, hearing.dt, epoch, hearing.pair)
         return (hearing.measured - shown)[:count], derivative[:count], hearing.noise.diagonal()[:count]
 
+    everything = np.ones(count, bool)
     found = sound_rows.likely(whole, count, belief.covariance, solve, look)
+    if not all(one.peak.settled for one in found):
+        return belief, ~everything
     if found:
         after, covariance = sound_rows.mixed(found, belief.covariance)
         return replace(belief, mean=after, covariance=covariance), found[0].kept
-    everything = np.ones(count, bool)
     misfit, redundancy = whole.misfit
     if whole.settled and misfit > sound_rows.limit(len(whole.miss)):
         wider = replace(hearing, noise=hearing.noise * (misfit / redundancy))
