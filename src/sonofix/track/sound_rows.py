@@ -19,14 +19,8 @@ from numpy.typing import NDArray
 from sonofix.locate.integrity import threshold
 from sonofix.records import Floats
 
-ODD = 1e-3
-"""Rows so unlikely together, or less likely, are looked at closer."""
-
-IMPOSSIBLE = 1e-6
-"""A hypothesis under which they are less likely is none."""
-
-FAULT = 13.8
-"""What a hypothesis pays that sees a fault, in rows or in the prediction: odds of 1000 to 1."""
+FALSE_ALARM = 1e-6
+"""Of the χ² test of all rows together: how often rows without fault are doubted, or a true hypothesis is not seen."""
 
 UNDECIDED = 9.2
 """Hypotheses that are less likely than the best by less than this are not ruled out: odds of 100 to 1."""
@@ -108,13 +102,13 @@ class Hypothesis:
 
 
 def odd(found: Peak) -> bool:
-    """Whether rows are so unlikely together that one of them may be wrong."""
-    return not found.settled or found.cost > threshold(len(found.miss), ODD)
+    """Whether rows cannot all be true together, or come to no state."""
+    return not found.settled or found.cost > limit(len(found.miss))
 
 
 def limit(count: int) -> float:
     """Return the cost of so many measurements beyond which they cannot all be true."""
-    return threshold(count, IMPOSSIBLE)
+    return threshold(count, FALSE_ALARM)
 
 
 def likely(
@@ -142,10 +136,8 @@ def likely(
     look : callable
         Gives of all rows at a mean: by how much ranges are too long, their derivative (r, n), their variance (r,).
     """
-    everything = np.ones(count, bool)
-    (right, may_be), (pushed, may_be_pushed) = whole.evidence(), whole.evidence(FREER)
-    weights = [right] * may_be + [pushed + FAULT] * may_be_pushed
-    found = [Hypothesis(everything, whole, min(weights))] if weights else []
+    weight, sound = whole.evidence(FREER)
+    found = [Hypothesis(np.ones(count, bool), whole, weight)] if sound else []
     ones = _solved(whole, count, 1, solve)
     found += _weighed(ones, 1.0, before, look)
     if not found:
@@ -205,5 +197,5 @@ def _weighed(
             late_m, derivative, variance = look(peak.mean)
             spread = np.einsum("ij,jk,ik->i", derivative, peak.covariance(before), derivative) + variance
             early = np.count_nonzero(~kept & (late_m < -NOISE_SIGMA * np.sqrt(spread)))
-            found.append(Hypothesis(kept, peak, weight + FAULT + EARLY * early))
+            found.append(Hypothesis(kept, peak, weight + EARLY * early))
     return found

@@ -35,7 +35,12 @@ BENT = 0.1
 
 
 def update(
-    belief: Belief, epoch: RangeEpoch, links: Links, candidates: NDArray[np.bool_], iterations: int = 20
+    belief: Belief,
+    epoch: RangeEpoch,
+    links: Links,
+    candidates: NDArray[np.bool_],
+    iterations: int = 20,
+    together: bool = True,
 ) -> tuple[Belief, NDArray[np.bool_], Floats]:
     """Correct a belief, already predicted to the epoch's instant, by the epoch's rows.
 
@@ -43,6 +48,11 @@ def update(
     ----------
     candidates : bool (n,)
         Rows worth asking; those that touch a vehicle without a position are left out.
+    iterations : int
+        At most.
+    together : bool
+        Whether our own ranges are judged together too. Not of a vehicle that is just being pushed: within the epoch it
+        moves as no model has it, and rows heard at different moments disagree.
 
     Returns
     -------
@@ -106,7 +116,7 @@ def update(
     ):
         iterations = 1
     found = _peak(belief, epoch, hearing, iterations, mean, (miss, derivative, crossed))
-    if trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
+    if together and trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
         after, used[rows[near]] = _sound(belief, epoch, hearing, iterations, mean, found)
         return after, used, surprise
     if not found.settled:
