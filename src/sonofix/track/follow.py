@@ -208,7 +208,7 @@ class Follower:
         if best is None:
             return used
         _, who, opened = best
-        opened, again, _ = update(opened, epoch, links, asked)
+        opened, again, _ = update(opened, epoch, links, asked, together=False)
         if np.count_nonzero(again) <= np.count_nonzero(used):
             return used
         self.belief = opened

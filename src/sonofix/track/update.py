@@ -5,7 +5,7 @@ An iterated extended Kalman update in Joseph form. Rows far from what is expecte
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from sonofix.geometry import SIZE, Links, rows_at
 from sonofix.locate.noise import row_noise
 from sonofix.records import Floats, RangeEpoch
-from sonofix.track import paired, stated
+from sonofix.track import paired, sound_rows, stated
 from sonofix.track.belief import Belief
+from sonofix.track.sound_rows import Peak
 
 GATE_SIGMA = 5.0
 """A row this many deviations from its prediction is not believed."""
@@ -34,7 +35,12 @@ BENT = 0.1
 
 
 def update(
-    belief: Belief, epoch: RangeEpoch, links: Links, candidates: NDArray[np.bool_], iterations: int = 20
+    belief: Belief,
+    epoch: RangeEpoch,
+    links: Links,
+    candidates: NDArray[np.bool_],
+    iterations: int = 20,
+    together: bool = True,
 ) -> tuple[Belief, NDArray[np.bool_], Floats]:
     """Correct a belief, already predicted to the epoch's instant, by the epoch's rows.
 
@@ -42,6 +48,11 @@ def update(
     ----------
     candidates : bool (n,)
         Rows worth asking; those that touch a vehicle without a position are left out.
+    iterations : int
+        At most.
+    together : bool
+        Whether our own ranges are judged together too. Not of a vehicle that is just being pushed: within the epoch it
+        moves as no model has it, and rows heard at different moments disagree.
 
     Returns
     -------
@@ -96,32 +107,104 @@ def update(
     if not near.any():
         return belief, used, surprise
     used[rows[near]] = True
+    hearing = Hearing(links, dt, measured, noise, pair)
     if not near.all():
         both = np.tile(near, 2) if with_rates else near
-        links, dt, measured, noise = links.rows(near), dt[near], measured[both], noise[both][:, both]
-        pair = pair[near] if len(pair) else pair
-        miss, derivative, crossed = miss[both], derivative[both], crossed[both]
-    if trust is not None and not _bent(belief, measured, noise.diagonal() + trust.variance[:, pair].sum(axis=0)):
+        hearing, miss, derivative, crossed = hearing.of(near), miss[both], derivative[both], crossed[both]
+    if trust is not None and not _bent(
+        belief, hearing.measured, hearing.noise.diagonal() + trust.variance[:, hearing.pair].sum(axis=0)
+    ):
         iterations = 1
-    gain, last = np.zeros((0, 0)), np.inf
+    found = _peak(belief, epoch, hearing, iterations, mean, (miss, derivative, crossed))
+    if together and trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
+        after, used[rows[near]] = _sound(belief, epoch, hearing, iterations, mean, found)
+        return after, used, surprise
+    if not found.settled:
+        used[:] = False
+        return belief, used, surprise
+    after = replace(belief, mean=found.mean, covariance=found.covariance(belief.covariance))
+    return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hearing:
+    """Some rows: their ends, their instants (r,) from the belief's, what they measured (m,), its noise, their pairs."""
+
+    links: Links
+    dt: Floats
+    measured: Floats
+    noise: Floats
+    pair: NDArray[np.int64]
+
+    def of(self, kept: NDArray[np.bool_]) -> Hearing:
+        """Return some of the rows."""
+        both = np.tile(kept, len(self.measured) // len(kept))
+        pair = self.pair[kept] if len(self.pair) else self.pair
+        return Hearing(self.links.rows(kept), self.dt[kept], self.measured[both], self.noise[both][:, both], pair)
+
+
+def _peak(
+    belief: Belief,
+    epoch: RangeEpoch,
+    hearing: Hearing,
+    iterations: int,
+    mean: Floats,
+    first: tuple[Floats, Floats, Floats] | None = None,
+) -> Peak:
+    """Return the most likely state, iterated from ``mean``.
+
+    ``first`` are innovations, derivative and its product with the covariance there, if they are known.
+    """
+    last = np.inf
+    expected = gain = np.zeros((0, 0))
+    miss, derivative, crossed = first or (np.zeros(0), gain, gain)
     for k in range(iterations if belief.about is None else 1):
-        if k:
-            shown, derivative = expect(links, belief, mean, dt, epoch, pair)
-            miss, crossed = measured - shown - derivative @ (belief.mean - mean), derivative @ belief.covariance
-        gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
+        if k or first is None:
+            shown, derivative = expect(hearing.links, belief, mean, hearing.dt, epoch, hearing.pair)
+            miss = hearing.measured - shown - derivative @ (belief.mean - mean)
+            crossed = derivative @ belief.covariance
+        expected = crossed @ derivative.T + hearing.noise
+        gain = np.linalg.solve(expected, crossed).T
         moved = belief.mean + gain @ miss
         last = float(np.abs(moved - mean).max())
         # steps that go to and fro (a height at the beacons' own, where ranges bend most) meet half-way
         mean = moved if k < WHOLE_STEPS or last < SETTLED else (mean + moved) / 2
         if last < SETTLED:
             break
-    if last > ASTRAY and iterations > 1 and belief.about is None:
-        used[:] = False
-        return belief, used, surprise
-    keep = np.eye(len(mean)) - gain @ derivative
-    covariance = keep @ belief.covariance @ keep.T + gain @ noise @ gain.T
-    after = replace(belief, mean=mean, covariance=(covariance + covariance.T) / 2)
-    return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
+    settled = last <= ASTRAY or iterations == 1 or belief.about is not None
+    return Peak(mean, derivative, miss, expected, hearing.noise, gain, settled)
+
+
+def _sound(
+    belief: Belief, epoch: RangeEpoch, hearing: Hearing, iterations: int, mean: Floats, whole: Peak
+) -> tuple[Belief, NDArray[np.bool_]]:
+    """Correct a belief by rows that cannot all be true; return which of them the likeliest hypothesis believes.
+
+    Where none is likely and rows gainsay each other, all are taken to err by as much as they do (Birge 1932).
+    """
+    count = len(hearing.dt)
+
+    def solve(kept: NDArray[np.bool_]) -> Peak:
+        return _peak(belief, epoch, hearing.of(kept), iterations, mean)
+
+    def look(at: Floats) -> tuple[Floats, Floats, Floats]:
+        shown, derivative = expect(hearing.links, belief, at, hearing.dt, epoch, hearing.pair)
+        return (hearing.measured - shown)[:count], derivative[:count], hearing.noise.diagonal()[:count]
+
+    everything = np.ones(count, bool)
+    found = sound_rows.likely(whole, count, belief.covariance, solve, look)
+    if not all(one.peak.settled for one in found):
+        return belief, ~everything
+    if found:
+        after, covariance = sound_rows.mixed(found, belief.covariance)
+        return replace(belief, mean=after, covariance=covariance), found[0].kept
+    misfit, redundancy = whole.misfit
+    if whole.settled and misfit > sound_rows.limit(len(whole.miss)):
+        wider = replace(hearing, noise=hearing.noise * (misfit / redundancy))
+        whole = _peak(belief, epoch, wider, iterations, mean)
+    if not whole.settled:
+        return belief, ~everything
+    return replace(belief, mean=whole.mean, covariance=whole.covariance(belief.covariance)), everything
 
 
 def linear(
