@@ -230,3 +230,29 @@ def test_real_odometry_with_ranges_that_are_off(data: Path, name: str, least: fl
             place = [np.interp(got.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]
             miss.append(np.hypot(*(got.position_m[:2] - place)))
     assert np.sqrt(np.mean(np.square(miss))) < least
+
+
+def test_a_start_amid_a_row_moves_as_that_row_tells() -> None:
+    drive, street = Drive((1.0, 1.0, 1.1), (0.8, 0.6, 0.0)), Street(SITE)
+    street.sense({"odometry": driving(0.0, drive, 6.0)})
+    street.follower.start("v", 0.05, drive.origin(0.05), float(np.arctan2(0.6, 0.8)))
+    aged = predict(street.follower.belief, 0.09, Motion())
+    np.testing.assert_allclose(aged.mean[:2], drive.origin(0.09)[:2], atol=1e-9)
+    np.testing.assert_allclose(aged.mean[4:6], (0.8, 0.6), atol=1e-9)
+
+
+def test_a_row_that_jumps_to_another_speed_is_not_believed(rng: np.random.Generator) -> None:
+    """One row in thirty tells twelve times the speed: the track stays where ranges of a centimetre have it."""
+    drive, street = Drive((1.0, 1.0, 1.1), (0.4, 0.3, 0.0)), Street(SITE)
+    table = driving(0.0, drive, 12.0)
+    speed = table.columns["v_mps"].copy()
+    speed[20::30] *= 12.0
+    street.sense({"odometry": replace(table, columns={**table.columns, "v_mps": speed})})
+    for k in range(22):
+        step = street.walk(make_epoch(SITE, drive, 0.05 + 0.5 * k, rng=rng))
+        if k > 4:
+            got = step.estimates[0]
+            off = (got.position_m - drive.origin(got.time_s))[:2]
+            assert np.hypot(*off) < 0.03
+            assert off @ np.linalg.solve(got.covariance[:2, :2], off) < 16.0
+    assert abs(street.follower.belief.mean[SLOT + 3]) < 0.02

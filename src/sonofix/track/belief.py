@@ -25,6 +25,9 @@ LOOSE = 0.5
 """Deviation in m and rad with which a place is taken that ranges with errors of their own gave: they speak again at
 once."""
 
+PUSHED_S = 1.0
+"""A push takes a while: for so long after it was noticed a vehicle's odometry is not heard."""
+
 INSTANT_S = 1e-9
 """Instants that differ by less are one: nothing moves meanwhile."""
 
@@ -84,6 +87,8 @@ class Belief:
         Factors on the noise of each vehicle's odometry that were learnt (`bank`); None: it is as expected.
     heeded : bool
         Whether what sensors tell enters.
+    deaf_s : float64 (V,) or None
+        Until when each vehicle's odometry does not enter: it was pushed; None: that of all does.
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -99,10 +104,15 @@ class Belief:
     trust: Trust | None = None
     rough: Floats | None = None
     heeded: bool = True
+    deaf_s: Floats | None = None
 
     def tilts(self, vehicle: int) -> float:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
         return 0.0 if self.tilt_sd_rad is None else float(self.tilt_sd_rad[vehicle])
+
+    def deaf(self, vehicle: int, time_s: float) -> bool:
+        """Whether a vehicle's odometry does not enter at an instant."""
+        return self.deaf_s is not None and time_s <= self.deaf_s[vehicle]
 
     def roughness(self, vehicle: int) -> Floats:
         """Factors (3,) on the noise of a vehicle's odometry."""
@@ -237,6 +247,25 @@ def _rock(belief: Belief, mean: Floats, covariance: Floats, motion: Motion, dt: 
             rock(mean, covariance, vehicle, belief.tilts(vehicle), motion.tilt_pace_radps, dt)
 
 
+def set_out(belief: Belief) -> Belief:
+    """Let vehicles that were placed since their last row of odometry move as that row tells."""
+    inputs = belief.inputs
+    if inputs is None or not belief.heeded:
+        return belief
+    for vehicle in np.flatnonzero(belief.placed & (inputs.wheel_slot >= 0)).tolist():
+        slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
+        if belief.free[slot] or not belief.free[SIZE * vehicle + YAW] or belief.deaf(vehicle, belief.time_s):
+            continue
+        row = inputs.holds(vehicle, belief.time_s)
+        if row is not None:
+            speed, rate = inputs.value[row, 4:6].tolist()
+            lone, rough = bool(inputs.gyro_slot[vehicle] < 0), belief.roughness(vehicle)
+            mean, covariance = belief.mean.copy(), belief.covariance.copy()
+            wheels.set_out(mean, covariance, vehicle, slot, (speed, rate), arm, rough, lone)
+            belief = replace(belief, mean=mean, covariance=covariance)
+    return belief
+
+
 def _sense(
     mean: Floats, covariance: Floats, free: NDArray[np.bool_], belief: Belief, row: int, about: Floats | None
 ) -> None:
@@ -248,6 +277,8 @@ def _sense(
     if inputs.kind[row] == STEP:
         steps.take(mean, covariance, free, vehicle, int(inputs.step_slot[vehicle]), first, second, about)
     elif inputs.kind[row] == WHEELS:
+        if belief.deaf(vehicle, float(inputs.time_s[row])):
+            return
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
         lone, rough = bool(inputs.gyro_slot[vehicle] < 0), belief.roughness(vehicle)
         wheels.take(mean, covariance, free, vehicle, slot, inputs.value[row], arm, about, rough, lone)
@@ -365,7 +396,9 @@ def reopen(belief: Belief, vehicle: int, far_m: float) -> Belief:
         lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
         lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
         lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
-    return replace(belief, mean=mean, covariance=covariance, free=free)
+    deaf_s = np.full(len(belief.placed), -np.inf) if belief.deaf_s is None else belief.deaf_s.copy()
+    deaf_s[vehicle] = belief.time_s + PUSHED_S
+    return replace(belief, mean=mean, covariance=covariance, free=free, deaf_s=deaf_s)
 
 
 def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estimate:

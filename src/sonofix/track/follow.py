@@ -15,7 +15,19 @@ from sonofix.site import Site
 from sonofix.track import stated
 from sonofix.track.alone import Alone, Silence, apart, unled
 from sonofix.track.bank import Bank
-from sonofix.track.belief import Belief, Motion, blank, estimate, loosen, place, predict, reopen, start_at, unplaced
+from sonofix.track.belief import (
+    Belief,
+    Motion,
+    blank,
+    estimate,
+    loosen,
+    place,
+    predict,
+    reopen,
+    set_out,
+    start_at,
+    unplaced,
+)
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
@@ -119,6 +131,7 @@ class Follower:
         self.belief = start_at(
             replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns, self.motion.tilt_pace_radps
         )
+        self.belief = set_out(self.belief)
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -160,7 +173,7 @@ class Follower:
         used = self._contest(epoch, links, candidates, used, events)
         self._heed(epoch, links, candidates & ~taken, events)
         if self.belief.heeded:
-            self.belief = self._course.head(self.belief)
+            self.belief = set_out(self._course.head(self.belief))
         self._doubt_wheels(before, epoch, links, candidates, events)
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)

@@ -306,6 +306,8 @@ class Problem:
             begun, at = self._begun.get((WHEELS, who)), SIZE * who
             if inputs.kind[row] != WHEELS or begun is None or anew[who] or not np.isfinite(told).all():
                 continue
+            if node.belief.deaf(who, float(inputs.time_s[row])):
+                continue
             start, pose = self.nodes[begun], (at, at + 1, at + YAW)
             if node.at(*pose) is None or start.at(*pose) is None or not 0.0 < told[2] <= wheels.LONGEST_S:
                 continue

@@ -13,7 +13,7 @@ from sonofix.records import Floats, Table
 from sonofix.site import Site
 from sonofix.track import stated as others
 from sonofix.track.gyro import summed
-from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
+from sonofix.track.wheels import LONGEST_S, STANDING_MPS, UNSEEN_RAD
 
 STEP_STATES = ("anchor_x", "anchor_y", "length", "heading")
 """What a walker adds to the state: where the step before ended, and by what share of itself a step's length is told too
@@ -82,6 +82,12 @@ class Inputs:
         """Rows told after one instant and until another; none where the second is before the first."""
         first, last = np.searchsorted(self.time_s, [after_s, until_s], side="right")
         return range(int(first), int(last))
+
+    def holds(self, vehicle: int, time_s: float) -> int | None:
+        """Number of the row of odometry that tells how a vehicle moves at an instant; None: there is none."""
+        own = (self.kind == WHEELS) & (self.vehicle == vehicle) & (self.time_s <= time_s)
+        rows = np.flatnonzero(own & (self.time_s > time_s - LONGEST_S))
+        return int(rows[-1]) if len(rows) else None
 
 
 def reckoned(inputs: Inputs, vehicle: int, until_s: float) -> Floats:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import POSE
 from sonofix.records import Event, Fix, Floats, RangeEpoch
-from sonofix.track.belief import SIZE, Belief, Nominal, predict
+from sonofix.track.belief import SIZE, Belief, Nominal, predict, set_out
 from sonofix.track.chain import Chain
 from sonofix.track.follow import Follower
 from sonofix.track.inputs import GYRO, Inputs, reckoned
@@ -222,4 +222,4 @@ def _opened(belief: Belief, opening: Opening) -> Belief:
         return belief
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
     open_heading(mean, covariance, free, opening.vehicle, opening.yaw_rad, ANY_HEADING_RAD)
-    return replace(belief, mean=mean, covariance=covariance, free=free)
+    return set_out(replace(belief, mean=mean, covariance=covariance, free=free))

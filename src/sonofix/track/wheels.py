@@ -123,6 +123,21 @@ def take(
     free[slot + 2] = free[at + 3]
 
 
+def set_out(
+    mean: Floats,
+    covariance: Floats,
+    vehicle: int,
+    slot: int,
+    told: tuple[float, float],
+    arm: Floats,
+    rough: Floats = AS_EXPECTED,
+    lone: bool = True,
+) -> None:
+    """Let a vehicle that was just placed move, in place, at the speed and yaw rate told by the row that holds."""
+    if np.all(np.isfinite(told)):
+        _go_on((mean, covariance, vehicle, slot), told, np.inf, arm, None, rough, lone)
+
+
 def _drive(
     belief: tuple[Floats, Floats, int, int],
     arc: tuple[float, float, float],
