@@ -16,6 +16,7 @@ import numpy as np
 
 from sonofix.locate.triangle import triangle
 from sonofix.records import Floats
+from sonofix.track.kernel import joseph
 
 SETTLED_M = 1e-9
 """Iterations end when no place moves by more."""
@@ -331,9 +332,7 @@ def _corrected(covariance: Floats, derivative: Floats, noise: Floats) -> tuple[F
     """Kalman gain, and the covariance after, in Joseph form."""
     crossed = derivative @ covariance
     gain = np.linalg.solve(crossed @ derivative.T + noise, crossed).T
-    keep = np.eye(len(covariance)) - gain @ derivative
-    after = keep @ covariance @ keep.T + gain @ noise @ gain.T
-    return gain, (after + after.T) / 2
+    return gain, joseph(covariance, gain, derivative, noise)
 
 
 def _base(formation: Formation, robot: str, pairs: Sequence[Pair]) -> tuple[list[int], list[int]]:

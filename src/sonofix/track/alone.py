@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import YAW, Links
 from sonofix.records import Fix, Floats, RangeEpoch
-from sonofix.track import gyro, stated, steps, wheels
+from sonofix.track import stated
 from sonofix.track.anchor import lift
-from sonofix.track.belief import Belief, Motion, loosen, place, predict
-from sonofix.track.rival import HEARD, bare
-from sonofix.track.update import update
+from sonofix.track.belief import Belief, Motion, begin_sensors, lift_anchors, loosen, place
+from sonofix.track.rival import bare, heard
 
 OUTDONE = 15.0
 """Sum of differences of log likelihoods at which sensors are not believed: were they right, it would come there less
@@ -50,11 +49,7 @@ class Alone:
         self, time_s: float, motion: Motion, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], others: float
     ) -> Alone:
         """Follow an epoch of which the track made the log likelihood ``others``."""
-        belief, _, _ = update(predict(self.belief, max(time_s, self.belief.time_s), motion), epoch, links, asked)
-        trust = belief.trust
-        if trust is None or trust.count[-1] < HEARD:
-            return replace(self, belief=belief)
-        news = trust.told - others
+        belief, _, news = heard(self.belief, time_s, motion, epoch, links, asked, others)
         return Alone(belief, max(self.ahead + news, 0.0), self.sum + news)
 
     @property
@@ -80,9 +75,7 @@ def apart(belief: Belief, found: Fix, arm: Floats) -> Alone | None:
     mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
     own = slice(inputs.range_slot - _sensed(belief), inputs.range_slot)
     mean[own], covariance[own, :], covariance[:, own], free[own] = 0.0, 0.0, 0.0, False
-    for room, slots in ((steps, inputs.step_slot), (wheels, inputs.wheel_slot), (gyro, inputs.gyro_slot)):
-        for slot in slots[slots >= 0].tolist():
-            room.begin(covariance, free, slot)
+    begin_sensors(inputs, covariance, free)
     stated.begin(mean, covariance, free, inputs.range_slot, inputs.known_sd_m)
     return Alone(
         replace(begun, mean=mean, covariance=covariance, free=free, trust=trust.anew(), rough=None, heeded=False)
@@ -93,10 +86,7 @@ def unled(belief: Belief, turns: bool) -> Alone:
     """Begin a track by ranges alone where a track is; its heading goes on where ranges tell it (``turns``)."""
     begun = bare(belief)
     mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
-    if belief.inputs is not None:
-        lift(mean, covariance, free, int(belief.inputs.step_slot[0]), 2)
-        lift(mean, covariance, free, int(belief.inputs.wheel_slot[0]), 3)
-        lift(mean, covariance, free, int(belief.inputs.gyro_slot[0]), 1)
+    lift_anchors(belief.inputs, 0, mean, covariance, free)
     if not turns:
         lift(mean, covariance, free, YAW, 1)
         lift(mean, covariance, free, YAW + 4, 1)

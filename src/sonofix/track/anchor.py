@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, YAW
 from sonofix.records import Floats
+from sonofix.track.kernel import joseph
 
 AGILE_TURN_PSD = 20.0
 """White angular acceleration in rad²/s³ that a vehicle whose turns a sensor tells adds to that of others: it turns on
@@ -59,7 +60,5 @@ def correct(mean: Floats, covariance: Floats, miss: Floats, derivative: Floats, 
     if miss @ np.linalg.solve(expected, miss) > unlikely:
         return
     gain = np.linalg.solve(expected, crossed).T
-    keep = np.eye(len(mean)) - gain @ derivative
-    after = keep @ covariance @ keep.T + gain @ noise @ gain.T
     mean += gain @ miss
-    covariance[:] = (after + after.T) / 2
+    covariance[:] = joseph(covariance, gain, derivative, noise)

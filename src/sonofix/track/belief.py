@@ -143,6 +143,23 @@ class Belief:
         return out
 
 
+def begin_sensors(inputs: Inputs, covariance: Floats, free: NDArray[np.bool_]) -> None:
+    """Open the errors of all vehicles' own sensors, in place, before anything is known of them."""
+    for room, slots in ((steps, inputs.step_slot), (wheels, inputs.wheel_slot), (gyro, inputs.gyro_slot)):
+        for slot in slots[slots >= 0].tolist():
+            room.begin(covariance, free, slot)
+
+
+def lift_anchors(
+    inputs: Inputs | None, vehicle: int, mean: Floats, covariance: Floats, free: NDArray[np.bool_]
+) -> None:
+    """Take the anchors of a vehicle's own sensors away, in place: they are not known on this track."""
+    if inputs is not None:
+        lift(mean, covariance, free, int(inputs.step_slot[vehicle]), 2)
+        lift(mean, covariance, free, int(inputs.wheel_slot[vehicle]), 3)
+        lift(mean, covariance, free, int(inputs.gyro_slot[vehicle]), 1)
+
+
 def blank(site: Site, inputs: Inputs | None = None) -> Belief:
     """Return the belief before anything was heard."""
     n = SIZE * len(site.vehicles) + (inputs.size if inputs else 0) + 2
@@ -150,9 +167,7 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
     for i, vehicle in enumerate(site.vehicles):
         mean[SIZE * i + 2] = vehicle.z_m or 0.0
     if inputs is not None:
-        for room, slots in ((steps, inputs.step_slot), (wheels, inputs.wheel_slot), (gyro, inputs.gyro_slot)):
-            for slot in slots[slots >= 0]:
-                room.begin(covariance, free, int(slot))
+        begin_sensors(inputs, covariance, free)
         if inputs.range_slot >= 0:
             stated.begin(mean, covariance, free, inputs.range_slot, inputs.known_sd_m)
         if inputs.bias_slot >= 0:
@@ -259,9 +274,9 @@ def set_out(belief: Belief) -> Belief:
         row = inputs.holds(vehicle, belief.time_s)
         if row is not None:
             speed, rate = inputs.value[row, 4:6].tolist()
-            lone, rough = bool(inputs.gyro_slot[vehicle] < 0), belief.roughness(vehicle)
+            lone, rough = inputs.lone_wheels(vehicle), belief.roughness(vehicle)
             mean, covariance = belief.mean.copy(), belief.covariance.copy()
-            wheels.set_out(mean, covariance, vehicle, slot, (speed, rate), arm, rough, lone)
+            wheels.go_on(mean, covariance, vehicle, slot, (speed, rate), arm, rough, lone)
             belief = replace(belief, mean=mean, covariance=covariance)
     return belief
 
@@ -280,7 +295,7 @@ def _sense(
         if belief.deaf(vehicle, float(inputs.time_s[row])):
             return
         slot, arm = int(inputs.wheel_slot[vehicle]), inputs.arm[vehicle]
-        lone, rough = bool(inputs.gyro_slot[vehicle] < 0), belief.roughness(vehicle)
+        lone, rough = inputs.lone_wheels(vehicle), belief.roughness(vehicle)
         wheels.take(mean, covariance, free, vehicle, slot, inputs.value[row], arm, about, rough, lone)
     elif inputs.kind[row] == GYRO:
         gyro.take(mean, covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), first, second)
@@ -297,13 +312,10 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
     if fix.position_m is None or fix.covariance is None:
         raise ValueError(f"a fix of status {fix.status!r} has no position to place vehicle {fix.vehicle} at")
     at = SIZE * vehicle
-    own = np.arange(at, at + SIZE)
     names = {name: at + i for i, name in enumerate(POSE)}
     shift, _ = from_arm(arm, np.zeros(3) if fix.velocity_mps is None else fix.velocity_mps)
-    mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
-    covariance[own, :] = covariance[:, own] = 0.0
-    free[own] = False
-    mean[own] = 0.0
+    begun = unplaced(belief, vehicle)
+    mean, covariance, free, placed = begun.mean, begun.covariance, begun.free, begun.placed
     mean[at : at + 3] = fix.position_m - np.append(shift, 0.0)
     if fix.velocity_mps is not None:
         mean[at + 4 : at + 7] = fix.velocity_mps
@@ -316,10 +328,6 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
         mean[clock] = [fix.clock_offset_m or 0.0, 0.0]
         covariance[-1, -1] = (CLOCK_SPEED_SD * SOUND_SPEED_MPS) ** 2
         free[clock] = True
-    if belief.inputs is not None:
-        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
-        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
-        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
     index = [names[state] for state in fix.states]
     covariance[np.ix_(index, index)] = fix.covariance
     free[index] = True
@@ -329,7 +337,6 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
             covariance[at + i, at + i] = 1.0
     if free[at + YAW] and belief.tilts(vehicle):
         open_tilt(covariance, free, vehicle, belief.tilts(vehicle), tilt_pace_radps)
-    placed = belief.placed.copy()
     placed[vehicle] = True
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
 
@@ -341,10 +348,7 @@ def unplaced(belief: Belief, vehicle: int) -> Belief:
     mean[np.delete(own, 2)] = 0.0  # a level that is stated stays
     covariance[own, :] = covariance[:, own] = 0.0
     free[own] = False
-    if belief.inputs is not None:
-        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
-        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
-        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
+    lift_anchors(belief.inputs, vehicle, mean, covariance, free)
     placed = belief.placed.copy()
     placed[vehicle] = False
     return replace(belief, mean=mean, covariance=covariance, free=free, placed=placed)
@@ -392,10 +396,7 @@ def reopen(belief: Belief, vehicle: int, far_m: float) -> Belief:
     covariance, mean, free = belief.covariance.copy(), belief.mean.copy(), belief.free.copy()
     for i, sd in ((0, far_m), (1, far_m), (4, 1.0), (5, 1.0)):
         covariance[SIZE * vehicle + i, SIZE * vehicle + i] += sd**2
-    if belief.inputs is not None:
-        lift(mean, covariance, free, int(belief.inputs.step_slot[vehicle]), 2)
-        lift(mean, covariance, free, int(belief.inputs.wheel_slot[vehicle]), 3)
-        lift(mean, covariance, free, int(belief.inputs.gyro_slot[vehicle]), 1)
+    lift_anchors(belief.inputs, vehicle, mean, covariance, free)
     deaf_s = np.full(len(belief.placed), -np.inf) if belief.deaf_s is None else belief.deaf_s.copy()
     deaf_s[vehicle] = belief.time_s + PUSHED_S
     return replace(belief, mean=mean, covariance=covariance, free=free, deaf_s=deaf_s)

@@ -128,7 +128,7 @@ class Problem:
             self.values.insert(k, belief.mean[index] / unit)
             self._zero.insert(k, np.zeros(len(node.index)))
         self._begun: dict[tuple[int, int], int] = {}
-        self._driven: dict[int, Floats] = {}
+        self._driven: dict[int, tuple[Floats, Floats]] = {}
         self._unseen: dict[int, float] = {}
         self._fresh(0, self.nodes[0].index)
         self._told(0)
@@ -264,7 +264,7 @@ class Problem:
                     self._chord(k, begun, who, first, second)
                 continue
             if begun is not None and who in self._driven:
-                self._drive(k, begun, who, self._driven[who])
+                self._drive(k, begun, who, *self._driven[who])
             if fourth > 0:
                 # what turns unseen does so after this knot: no arc begins here
                 self._unseen[who] = fourth
@@ -294,12 +294,18 @@ class Problem:
         def measure(state: Floats) -> tuple[Floats, Floats, Floats]:
             return steps.measure(state, who, slot, length_m, heading_rad)
 
-        self._difference(k, begun, (SIZE * who, SIZE * who + 1), (slot, slot + 1), measure)
+        difference = k, begun, (SIZE * who, SIZE * who + 1), (slot, slot + 1), measure
+        noise = self._noise(*difference)
+        if noise is not None:
+            self._difference(*difference, noise)
 
-    def _believed(self, k: int, anew: NDArray[np.bool_]) -> dict[int, Floats]:
-        """Return what odometry told by a node of vehicles that it carries there: as in the filter, and nothing else."""
+    def _believed(self, k: int, anew: NDArray[np.bool_]) -> dict[int, tuple[Floats, Floats]]:
+        """Return what odometry tells by a node of vehicles that it carries there, and its noise.
+
+        As in the filter, nothing else ties such a vehicle to the node before.
+        """
         node, inputs = self.nodes[k], self._passage.follower.belief.inputs
-        driven: dict[int, Floats] = {}
+        driven: dict[int, tuple[Floats, Floats]] = {}
         for row in node.mark.rows if inputs is not None and node.belief.heeded else ():
             assert inputs is not None
             who, told = int(inputs.vehicle[row]), inputs.value[row]
@@ -308,28 +314,28 @@ class Problem:
                 continue
             if node.belief.deaf(who, float(inputs.time_s[row])):
                 continue
-            start, pose = self.nodes[begun], (at, at + 1, at + YAW)
-            if node.at(*pose) is None or start.at(*pose) is None or not 0.0 < told[2] <= wheels.LONGEST_S:
+            pose = (at, at + 1, at + YAW)
+            if node.at(*pose) is None or not 0.0 < told[2] <= wheels.LONGEST_S:
                 continue
             slot = int(inputs.wheel_slot[who])
-            state = node.whole(self.values.atVector(k))
-            state[slot : slot + 3] = start.whole(self.values.atVector(begun))[list(pose)]
-            arc, rough = (float(told[0]), float(told[1]), float(told[2])), node.belief.roughness(who)
-            off, _, noise = wheels.measure(state, who, slot, arc, inputs.arm[who], rough)
-            # what cannot be is left out, as the filter does: a push goes on after the epoch that told of it
-            if off @ np.linalg.solve(noise, off) <= wheels.UNLIKELY:
-                driven[who] = told
+            noise = self._noise(k, begun, pose, (slot, slot + 1, slot + 2), self._arc(k, who, told))
+            if noise is not None:
+                driven[who] = told, noise
         return driven
 
-    def _drive(self, k: int, begun: int, who: int, told: Floats) -> None:
+    def _arc(self, k: int, who: int, told: Floats) -> Callable[[Floats], tuple[Floats, Floats, Floats]]:
+        """Return what measures an arc that leads to a node."""
+        inputs, rough = self._passage.follower.belief.inputs, self.nodes[k].belief.roughness(who)
+        assert inputs is not None
+        slot, arm, (way, turn, dt) = int(inputs.wheel_slot[who]), inputs.arm[who], told[:3].tolist()
+        return lambda state: wheels.measure(state, who, slot, (way, turn, dt), arm, rough)
+
+    def _drive(self, k: int, begun: int, who: int, told: Floats, noise: Floats) -> None:
         """Let an arc lead to a node, and what is told next say how it goes on from there."""
         inputs, node, at = self._passage.follower.belief.inputs, self.nodes[k], SIZE * who
         assert inputs is not None
         slot, arm, rough = int(inputs.wheel_slot[who]), inputs.arm[who], node.belief.roughness(who)
-        way, turn, dt, _, speed, rate = told.tolist()
-
-        def measure(state: Floats) -> tuple[Floats, Floats, Floats]:
-            return wheels.measure(state, who, slot, (way, turn, dt), arm, rough)
+        speed, rate = told[4:].tolist()
 
         def miss(_factor: Any, values: Any, jacobians: Any) -> Floats:
             off, derivative, _ = wheels.going(node.whole(values.atVector(k)), who, slot, (speed, rate), arm, rough)
@@ -337,9 +343,29 @@ class Problem:
                 jacobians[0] = node.by(derivative)
             return -off
 
-        self._difference(k, begun, (at, at + 1, at + YAW), (slot, slot + 1, slot + 2), measure)
-        noise = wheels.going(node.whole(self.values.atVector(k)), who, slot, (speed, rate), arm, rough)[2]
-        self.graph.add(self._gtsam.CustomFactor(self._robust(noise), [k], miss))
+        self._difference(k, begun, (at, at + 1, at + YAW), (slot, slot + 1, slot + 2), self._arc(k, who, told), noise)
+        uneven = wheels.going(node.whole(self.values.atVector(k)), who, slot, (speed, rate), arm, rough)[2]
+        self.graph.add(self._gtsam.CustomFactor(self._robust(uneven), [k], miss))
+
+    def _noise(
+        self,
+        k: int,
+        begun: int,
+        pose: tuple[int, ...],
+        anchor: tuple[int, ...],
+        measure: Callable[[Floats], tuple[Floats, Floats, Floats]],
+    ) -> Floats | None:
+        """Return the noise of a `_difference`; None where it cannot be, and is left out, as the filter does.
+
+        So a push goes on after the epoch that told of it.
+        """
+        node, start = self.nodes[k], self.nodes[begun]
+        if start.at(*pose) is None:
+            return None
+        state = node.whole(self.values.atVector(k))
+        state[list(anchor)] = start.whole(self.values.atVector(begun))[list(pose)]
+        off, _, noise = measure(state)
+        return noise if off @ np.linalg.solve(noise, off) <= wheels.UNLIKELY else None
 
     def _difference(
         self,
@@ -348,11 +374,10 @@ class Problem:
         pose: tuple[int, ...],
         anchor: tuple[int, ...],
         measure: Callable[[Floats], tuple[Floats, Floats, Floats]],
+        noise: Floats,
     ) -> None:
         """Add a measurement of a node and of the pose at an earlier one, which takes the anchor's place."""
         node, start = self.nodes[k], self.nodes[begun]
-        if start.at(*pose) is None:
-            return
 
         def miss(_factor: Any, values: Any, jacobians: Any) -> Floats:
             state = node.whole(values.atVector(k))
@@ -364,12 +389,7 @@ class Problem:
                 jacobians[0], jacobians[1] = node.by(derivative), start.by(earlier)
             return -off
 
-        state = node.whole(self.values.atVector(k))
-        state[list(anchor)] = start.whole(self.values.atVector(begun))[list(pose)]
-        off, _, noise = measure(state)
-        # what cannot be is left out, as the filter does: a push goes on after the epoch that told of it
-        if off @ np.linalg.solve(noise, off) <= wheels.UNLIKELY:
-            self.graph.add(self._gtsam.CustomFactor(self._robust(noise), [k, begun], miss))
+        self.graph.add(self._gtsam.CustomFactor(self._robust(noise), [k, begun], miss))
 
 
 def _transition(passage: Passage, belief: Belief, until_s: float) -> tuple[Floats, Floats]:

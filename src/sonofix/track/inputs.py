@@ -83,6 +83,10 @@ class Inputs:
         first, last = np.searchsorted(self.time_s, [after_s, until_s], side="right")
         return range(int(first), int(last))
 
+    def lone_wheels(self, vehicle: int) -> bool:
+        """Whether nothing but a vehicle's odometry tells of its turns."""
+        return bool(self.gyro_slot[vehicle] < 0)
+
     def holds(self, vehicle: int, time_s: float) -> int | None:
         """Number of the row of odometry that tells how a vehicle moves at an instant; None: there is none."""
         own = (self.kind == WHEELS) & (self.vehicle == vehicle) & (self.time_s <= time_s)

@@ -1,4 +1,4 @@
-"""What every filter here is made of: one scalar measurement at a time, in Joseph form, as a compiled kernel.
+"""What every filter here is made of: Joseph's form, and one scalar measurement at a time by it, as a compiled kernel.
 
 Rows that share noise are whitened first (`locate.dense.whitener`); taken one by one they then give the very same result
 as together, without a matrix to invert (Bierman 1977, section II.7).
@@ -7,6 +7,19 @@ as together, without a matrix to invert (Bierman 1977, section II.7).
 from __future__ import annotations
 
 import numba
+import numpy as np
+
+from sonofix.records import Floats
+
+
+def joseph(before: Floats, gain: Floats, derivative: Floats, noise: Floats) -> Floats:
+    """Return a covariance (n, n) after measurements of ``derivative`` (m, n) and ``noise`` (m, m) entered by ``gain``.
+
+    Joseph form (Bucy & Joseph 1968), exactly symmetric.
+    """
+    keep = np.eye(len(before)) - gain @ derivative
+    after = keep @ before @ keep.T + gain @ noise @ gain.T
+    return (after + after.T) / 2
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -50,11 +50,8 @@ class Rival:
         self, time_s: float, motion: Motion, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], others: float
     ) -> tuple[Rival, NDArray[np.bool_]]:
         """Follow an epoch of which the track made the log likelihood ``others``; return the rows used, too."""
-        belief, used, _ = update(predict(self.belief, max(time_s, self.belief.time_s), motion), epoch, links, asked)
-        trust = belief.trust
-        if trust is None or trust.count[-1] < HEARD:
-            return replace(self, belief=belief), used
-        return replace(self, belief=belief, ahead=self.ahead + trust.told - others), used
+        belief, used, news = heard(self.belief, time_s, motion, epoch, links, asked, others)
+        return replace(self, belief=belief, ahead=self.ahead + news), used
 
     @property
     def won(self) -> bool:
@@ -65,6 +62,29 @@ class Rival:
     def lost(self) -> bool:
         """Whether it is less likely beyond doubt, or has had its time."""
         return self.ahead < -DECIDED or self.belief.time_s - self.since_s > TRIED_S
+
+
+def heard(
+    belief: Belief,
+    time_s: float,
+    motion: Motion,
+    epoch: RangeEpoch,
+    links: Links,
+    asked: NDArray[np.bool_],
+    others: float,
+) -> tuple[Belief, NDArray[np.bool_], float]:
+    """Let a track beside the track take in an epoch of which that made the log likelihood ``others``.
+
+    Returns
+    -------
+    belief : Belief
+    used : bool (n,)
+    news : float
+        By how much it was likelier; 0 while it is not known how large noise is.
+    """
+    belief, used, _ = update(predict(belief, max(time_s, belief.time_s), motion), epoch, links, asked)
+    trust = belief.trust
+    return belief, used, 0.0 if trust is None or trust.count[-1] < HEARD else trust.told - others
 
 
 def image(belief: Belief, vehicle: int, links: Links, like: Fix) -> Fix:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sonofix.locate.integrity import threshold
 from sonofix.records import Floats
+from sonofix.track.kernel import joseph
 
 FALSE_ALARM = 1e-6
 """Of the χ² test of all rows together: how often rows without fault are doubted, or a true hypothesis is not seen."""
@@ -87,9 +88,7 @@ class Peak:
 
     def covariance(self, before: Floats) -> Floats:
         """Return the state's covariance, by Joseph's form, where ``before`` was predicted."""
-        keep = np.eye(len(self.mean)) - self.gain @ self.derivative
-        after = keep @ before @ keep.T + self.gain @ self.noise @ self.gain.T
-        return (after + after.T) / 2
+        return joseph(before, self.gain, self.derivative, self.noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

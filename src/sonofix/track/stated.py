@@ -49,6 +49,9 @@ LIGHT = 30.0
 
 FREEDOM = (HEAVY, LIGHT)
 
+_FREEDOM = np.array(FREEDOM)[:, None]
+_LEAD = np.array([lgamma((nu + 1.0) / 2) - lgamma(nu / 2) - 0.5 * log(nu) for nu in FREEDOM])[:, None]
+
 TAILED = 3.0
 """Logarithm of the odds for heavy tails before anything was heard."""
 
@@ -170,13 +173,13 @@ class Trust:
         likely each has been, row by row. Of the tails of noise a row tells as far as ``noise`` (n,) is its variance:
         by the square of that share, as the kurtosis of a sum has it.
         """
-        spreads = spread - self.extra(pair) + self.extras(pair)
-        surprise, freedom = miss**2 / spreads, np.array(FREEDOM)[:, None]
-        told = log_likelihood(surprise, spreads)
+        tails, extras = self.tails, self.extras(pair)
+        spreads = spread - tails @ extras + extras
+        told = log_likelihood(miss**2 / spreads, spreads)
         tells = (noise / spread) ** 2
-        larger = 1.0 / (self.tails @ (1.0 / heavier(miss**2 / spread, freedom)))
+        larger = 1.0 / (tails @ (1.0 / heavier(miss**2 / spread, _FREEDOM)))
         tailed = float(np.clip(self.tailed + (told[0] - told[1]) @ tells, -UNDONE, UNDONE))
-        each = self.tails @ told
+        each = tails @ told
         return replace(self, told=float(np.sum(np.maximum(each, STRAY))), tailed=tailed), larger
 
     def heard(
@@ -230,8 +233,7 @@ class Trust:
         errors : float64 (2, n)
             The same of the rows' slow and quick errors: square of the mean, and variance.
         """
-        freedom = np.array(FREEDOM)[:, None]
-        counted = (freedom + 1.0) / (freedom + square / (stated + self.extras(pair))) * square
+        counted = (_FREEDOM + 1.0) / (_FREEDOM + square / (stated + self.extras(pair))) * square
         count, squares, claims = self.count.copy(), self.square.copy(), self.stated.copy()
         own, weight, pool = self.own.copy(), self.weight.copy(), self.pool.copy()
         errors = np.minimum(errors, MOST * self.variance[:, pair])
@@ -334,6 +336,4 @@ def log_likelihood(surprise: Floats, variance: Floats) -> Floats:
 
     ``surprise`` and ``variance`` (2, n).
     """
-    freedom = np.array(FREEDOM)[:, None]
-    lead = np.array([lgamma((nu + 1.0) / 2) - lgamma(nu / 2) - 0.5 * log(nu) for nu in FREEDOM])[:, None]
-    return lead - 0.5 * ((freedom + 1.0) * np.log1p(surprise / freedom) + np.log(variance))
+    return _LEAD - 0.5 * ((_FREEDOM + 1.0) * np.log1p(surprise / _FREEDOM) + np.log(variance))

@@ -107,14 +107,14 @@ def take(
     way, turn, dt, unseen, speed, rate = told.tolist()
     # of all headings that it may have set out on: mean of u(α) is exp(-σ²/2) u(mean of α)
     shorter = 1.0 if about is not None else float(np.exp(-covariance[slot + 2, slot + 2] / 2))
-    belief = (mean, covariance, vehicle, slot)
     drives = free[slot] and free[slot + 2] and np.all(np.isfinite(told[:4])) and 0.0 < dt <= LONGEST_S
     if drives:
-        _drive(belief, (shorter * way, turn, dt), arm, about, rough, lone)
+        _drive(mean, covariance, vehicle, slot, (shorter * way, turn, dt), arm, rough, lone, about)
     if free[at + 3]:
         covariance[at + 3, at + 3] += unseen**2
-        if np.isfinite(speed) and np.isfinite(rate) and dt != 0.0:
-            _go_on(belief, (shorter * speed, rate), dt if drives else np.inf, arm, about, rough, lone)
+        if dt != 0.0:
+            since_s = dt if drives else np.inf
+            go_on(mean, covariance, vehicle, slot, (shorter * speed, rate), arm, rough, lone, about, since_s)
     for own, of in ((slice(slot, slot + 2), slice(at, at + 2)), (slot + 2, at + 3)):
         mean[own] = mean[of]
         covariance[own, :] = covariance[of, :]
@@ -123,31 +123,18 @@ def take(
     free[slot + 2] = free[at + 3]
 
 
-def set_out(
+def _drive(
     mean: Floats,
     covariance: Floats,
     vehicle: int,
     slot: int,
-    told: tuple[float, float],
-    arm: Floats,
-    rough: Floats = AS_EXPECTED,
-    lone: bool = True,
-) -> None:
-    """Let a vehicle that was just placed move, in place, at the speed and yaw rate told by the row that holds."""
-    if np.all(np.isfinite(told)):
-        _go_on((mean, covariance, vehicle, slot), told, np.inf, arm, None, rough, lone)
-
-
-def _drive(
-    belief: tuple[Floats, Floats, int, int],
     arc: tuple[float, float, float],
     arm: Floats,
-    about: Floats | None,
     rough: Floats,
     lone: bool,
+    about: Floats | None,
 ) -> None:
     """Put a vehicle, in place, where an arc leads from its anchor; open its place where the arc cannot be."""
-    mean, covariance, vehicle, slot = belief
     at = SIZE * vehicle
     here = mean.copy() if about is None else about
     miss, derivative, noise = measure(here, vehicle, slot, arc, arm, rough)
@@ -165,17 +152,24 @@ def _drive(
     _put(mean, covariance, slice(at, at + 2), here, miss[:2], derivative[:2], noise[:2, :2])
 
 
-def _go_on(
-    belief: tuple[Floats, Floats, int, int],
+def go_on(
+    mean: Floats,
+    covariance: Floats,
+    vehicle: int,
+    slot: int,
     told: tuple[float, float],
-    since_s: float,
     arm: Floats,
-    about: Floats | None,
-    rough: Floats,
-    lone: bool,
+    rough: Floats = AS_EXPECTED,
+    lone: bool = True,
+    about: Floats | None = None,
+    since_s: float = np.inf,
 ) -> None:
-    """Let a vehicle move, in place, as the row tells that holds from now on, unless it cannot be so since the last."""
-    mean, covariance, vehicle, slot = belief
+    """Let a vehicle move, in place, at the speed and yaw rate of the row that holds from now on.
+
+    Unless it cannot have come to that speed in ``since_s``. A row with an empty cell tells nothing.
+    """
+    if not np.all(np.isfinite(told)):
+        return
     at = SIZE * vehicle
     here = mean.copy() if about is None else about
     miss, derivative, noise = going(here, vehicle, slot, told, arm, rough)
