@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sonofix.locate.fix import fix
-from sonofix.locate.sound_speed import SoundSpeed
+from sonofix.locate.sound_speed import SoundSpeed, thermometer
 from sonofix.locate.unstated import fix_by_residuals
 from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step, Table
 from sonofix.site import Site
@@ -28,10 +28,11 @@ class Street:
         self._written_s: float | None = None
 
     def sense(self, tables: Mapping[str, Table], stated: tuple[tuple[str, str], ...] | None = None) -> None:
-        """Let what vehicles' own sensors tell of their motion enter, each row at its time; before the first epoch.
+        """Let what vehicles' own sensors and a thermometer tell enter, each row at its time; before the first epoch.
 
         ``stated``: pairs (emitter, receiver) whose ranges come from others, with errors of their own.
         """
+        self.air = SoundSpeed(thermometer(self.site, tables.get("temperature")))
         inputs = gather(self.site, tables, stated)
         self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs)
 

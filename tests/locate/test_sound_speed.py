@@ -10,11 +10,13 @@ import pytest
 
 import sonofix
 from locate.made_epochs import HALL, SPEED, Drive, make_epoch, make_site
+from sonofix.air import sound_speed_mps
 from sonofix.locate.fix import fix
-from sonofix.locate.sound_speed import SoundSpeed
+from sonofix.locate.sound_speed import SoundSpeed, thermometer
 from sonofix.ranging import with_sound_speed
-from sonofix.records import RangeEpoch
-from sonofix.site import Site
+from sonofix.records import RangeEpoch, Table
+from sonofix.site import AirSection, Site
+from sonofix.street import Street
 
 AIR = Path(__file__).parents[2].parent / "shared" / "captures" / "air"
 PLACE = (3.0, 5.5, 1.1)
@@ -139,6 +141,50 @@ def test_a_door_that_opens_is_followed(rng: np.random.Generator) -> None:
         told += len(air.take(epoch, lambda e: (fix(e, SITE, "v"),))[2])
     assert air.sound_speed_mps == pytest.approx(SPEED + 4.0, rel=1e-3)
     assert told == 2
+
+
+def warming(off_k: float = 0.0) -> Table:
+    """A hall that warms by 6 K in a minute, by a thermometer that is read every two seconds; one cell is empty."""
+    time_s = np.arange(0.0, 61.0, 2.0)
+    told_c = 17.0 + time_s / 10 + off_k
+    told_c[5] = np.nan
+    return Table({"time_s": time_s, "temperature_c": told_c})
+
+
+@pytest.mark.parametrize("off_k", [0.0, 2.0])
+@pytest.mark.parametrize("beacons", [3, 8])
+def test_a_hall_that_warms_is_followed_by_its_thermometer(beacons: int, off_k: float, rng: np.random.Generator) -> None:
+    ends = (*HALL, (0.0, 4.0, 1.5), (10.0, 4.0, 2.9))[:beacons]
+    site = make_site(ends, bounds_m=((0.0, 0.0, 0.0), (10.0, 8.0, 3.2)))
+    site = site.model_copy(update={"air": AirSection(temperature_c=20.0)})
+    street, away, sigmas = Street(site), [], []
+    street.sense({"temperature": warming(off_k)})
+    for step in range(120):
+        true_mps = sound_speed_mps(17.0 + 0.05 * step)
+        heard = noisy(rng, site, time_s=0.5 * step)
+        scale = SPEED / true_mps
+        epoch = wrong(replace(heard, range_m=heard.range_m * scale, time_s=heard.time_s + 0.5 * step), 0.0)
+        epoch = with_sound_speed(epoch, site.sound_speed_mps, site.sound_speed_sd_mps)
+        (told,) = street.walk(epoch).estimates
+        miss = told.position_m - PLACE
+        away.append(float(np.linalg.norm(miss)))
+        sigmas.append(float(miss @ np.linalg.solve(told.covariance[:3, :3], miss)))
+    rms_m = np.sqrt(np.mean(np.square(away)))
+    if beacons == 8:
+        # the thermometer's changes are followed, its error learnt
+        assert rms_m < 0.006
+        assert street.air.sound_speed_mps == pytest.approx(sound_speed_mps(22.95), rel=5e-4)
+        assert np.mean(sigmas) < 3 * 1.5
+    else:
+        # nothing is to spare: the thermometer stands; the site's 20 °C alone would leave 3 K, and 6 cm
+        assert rms_m < 0.015 or off_k != 0.0
+        # a thermometer that is off by two of its deviations adds their square
+        assert np.mean(sigmas) < 1.2 * (3 if off_k == 0.0 else 3 + 2**2)
+
+
+def test_a_speed_that_the_site_states_needs_no_thermometer() -> None:
+    assert thermometer(make_site(HALL), warming()) is None
+    assert thermometer(make_site(HALL), None) is None
 
 
 @pytest.mark.skipif(not AIR.is_dir(), reason="no recordings here")
