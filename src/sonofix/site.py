@@ -137,13 +137,15 @@ class Vehicle(_Section):
     """`[[vehicle]]`: its origin moves on the level `z_m` where that is known.
 
     `tilt_sd_rad` is how far it tilts, one sigma of roll and of pitch; 0: it always stands upright. Where it is not
-    stated, `geometry.tilting` says what holds.
+    stated, `geometry.tilting` says what holds. `motion` is what a track expects of it between two measurements: that it
+    goes straight on, or that it drives in arcs (`track.arc`).
     """
 
     id: Id
     z_m: Number | None = None
     max_speed_mps: Positive | None = None
     tilt_sd_rad: NotNegative | None = None
+    motion: Literal["constant-velocity", "constant-turn"] = "constant-velocity"
 
 
 class MSequenceCode(_Section):

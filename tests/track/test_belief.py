@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site
-from sonofix.geometry import SIZE
+from sonofix.geometry import SIZE, YAW
 from sonofix.locate.fix import fix
 from sonofix.records import Floats
 from sonofix.track.belief import Belief, Motion, age, blank, estimate, place, predict, start_at
@@ -223,7 +223,8 @@ def test_ageing_matches_its_plain_twin(rng: np.random.Generator) -> None:
         step, noise = np.eye(n), np.zeros((n, n))
         pairs = [(SIZE * v + k, SIZE * v + 4 + k, psd) for v in (0, 2) for k, psd in enumerate((0.5, 0.5, 0.01, 0.3))]
         for at, rate, psd in [*pairs, (n - 2, n - 1, 1e-6)]:
-            if not free[rate]:
+            # a course turns without a heading
+            if not free[rate] or (at % SIZE == YAW and at < n - 2 and not free[at]):
                 continue
             step[at, rate] = dt
             noise[rate, rate] = psd * abs(dt)

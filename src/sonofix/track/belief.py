@@ -14,6 +14,7 @@ from sonofix.records import Estimate, Fix, Floats, Source
 from sonofix.site import Site
 from sonofix.track import gyro, paired, stated, steps, wheels
 from sonofix.track.anchor import lift
+from sonofix.track.arc import bend, open_course
 from sonofix.track.inputs import GYRO, STEP, WHEELS, Inputs
 from sonofix.track.stated import Trust
 from sonofix.track.tilt import open_tilt, rock
@@ -38,7 +39,8 @@ class Motion:
 
     ``acceleration_psd`` in m²/s³ per horizontal axis, ``climb_psd`` upwards (vehicles keep to floors), ``turn_psd`` in
     rad²/s³, ``clock_psd`` in m²/s³ of the clock's drift. Roll and pitch of a body that tilts come back upright at
-    ``tilt_pace_radps``, the natural frequency of `tilt.rock`.
+    ``tilt_pace_radps``, the natural frequency of `tilt.rock`. Of vehicles that drive in arcs (`bend`) the acceleration
+    has ``arc_psd``, m²/s³, in place of ``acceleration_psd``.
     """
 
     acceleration_psd: float = 0.5
@@ -46,6 +48,7 @@ class Motion:
     turn_psd: float = 0.3
     clock_psd: float = 1e-6
     tilt_pace_radps: float = 2.0
+    arc_psd: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +92,8 @@ class Belief:
         Whether what sensors tell enters.
     deaf_s : float64 (V,) or None
         Until when each vehicle's odometry does not enter: it was pushed; None: that of all does.
+    bends : bool (V,) or None
+        Vehicles that drive in arcs: their velocity turns with them (`bend`); None: none do.
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -105,10 +110,15 @@ class Belief:
     rough: Floats | None = None
     heeded: bool = True
     deaf_s: Floats | None = None
+    bends: NDArray[np.bool_] | None = None
 
     def tilts(self, vehicle: int) -> float:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
         return 0.0 if self.tilt_sd_rad is None else float(self.tilt_sd_rad[vehicle])
+
+    def bent(self, vehicle: int) -> bool:
+        """Whether a vehicle drives in arcs."""
+        return self.bends is not None and bool(self.bends[vehicle])
 
     def deaf(self, vehicle: int, time_s: float) -> bool:
         """Whether a vehicle's odometry does not enter at an instant."""
@@ -174,7 +184,8 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
             paired.begin(covariance, free, inputs.bias_slot, inputs.known_sd_m)
     trust = stated.trust(len(inputs.pairs)) if inputs is not None and inputs.range_slot >= 0 else None
     placed = np.zeros(len(site.vehicles), bool)
-    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site), trust=trust)
+    bends = np.array([vehicle.motion == "constant-turn" for vehicle in site.vehicles], bool)
+    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site), trust=trust, bends=bends)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -194,10 +205,11 @@ def drift(mean, covariance, at, rate, free, density, dt):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def age(mean, covariance, free, placed, densities, dt):
+def age(mean, covariance, free, placed, bends, densities, dt):
     """Move a belief's ``mean`` and ``covariance`` by ``dt``, in place.
 
-    ``densities`` (4,) are those of `Motion`: along a horizontal axis, upwards, of turns, and of the clock's drift.
+    ``densities`` (5,) are those of `Motion`: along a horizontal axis, upwards, of turns, of the clock's drift, and of
+    vehicles that drive in arcs, ``bends`` (V,).
     The noise of an integrated pair is that of white acceleration (Bar-Shalom 2001, eq 6.2.2-12).
     """
     n = len(mean)
@@ -209,7 +221,12 @@ def age(mean, covariance, free, placed, densities, dt):
             at, rate, density = n - 2, n - 1, densities[3]
         elif not placed[vehicle]:
             continue
-        if not free[rate]:
+        elif bends[vehicle] and part < 2:
+            if part == 0:
+                bend(mean, covariance, free, vehicle, densities[4], dt)
+            continue
+        # a course's rate of turn is free without a heading
+        if not free[rate] or not (free[at] or part < 3 or pair == 4 * len(placed)):
             continue
         drift(mean, covariance, at, rate, free[at], density, dt)
 
@@ -226,16 +243,17 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     if (abs(dt) < INSTANT_S and not told) or not belief.placed.any():
         return replace(belief, time_s=time_s)
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free
-    densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd])
+    densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd, motion.arc_psd])
+    bends = np.zeros(len(belief.placed), bool) if belief.bends is None else belief.bends
     inputs, now_s = belief.inputs, belief.time_s
     if inputs is None:
-        age(mean, covariance, free, belief.placed, densities, float(dt))
+        age(mean, covariance, free, belief.placed, bends, densities, float(dt))
         _rock(belief, mean, covariance, motion, float(dt))
         return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
     free = free.copy()
     for row in (*told, None):
         until_s = time_s if row is None else float(inputs.time_s[row])
-        age(mean, covariance, free, belief.placed, densities, until_s - now_s)
+        age(mean, covariance, free, belief.placed, bends, densities, until_s - now_s)
         _rock(belief, mean, covariance, motion, until_s - now_s)
         for vehicle, (step, wheel) in enumerate(
             zip(inputs.step_slot.tolist(), inputs.wheel_slot.tolist(), strict=True)
@@ -335,6 +353,8 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
         if free[at + open_by] and not free[at + i]:
             free[at + i] = True
             covariance[at + i, at + i] = 1.0
+    if belief.bent(vehicle) and not free[at + YAW]:
+        open_course(covariance, free, vehicle)
     if free[at + YAW] and belief.tilts(vehicle):
         open_tilt(covariance, free, vehicle, belief.tilts(vehicle), tilt_pace_radps)
     placed[vehicle] = True
@@ -384,6 +404,8 @@ def start_at(
             continue
         free[at + i] = True
         covariance[at + i, at + i] = sd**2
+    if belief.bent(vehicle) and not turns:
+        open_course(covariance, free, vehicle)
     if turns and belief.tilts(vehicle):
         open_tilt(covariance, free, vehicle, belief.tilts(vehicle), tilt_pace_radps)
     placed = belief.placed.copy()

@@ -175,7 +175,7 @@ class Problem:
     def _move(self, k: int) -> NDArray[np.bool_]:
         """Tie a node to the one before by the motion; return the vehicles that were placed there, by ranges or anew."""
         before, node = self.nodes[k - 1], self.nodes[k]
-        step, noise = _transition(self._passage, before.belief, node.belief.time_s)
+        step, shift, noise = _transition(self._passage, before.belief, node.belief.time_s)
         names = [vehicle.id for vehicle in self._passage.follower.site.vehicles]
         anew = ~before.belief.placed & node.belief.placed
         for event in node.mark.entered.events if node.mark.entered is not None else ():
@@ -202,7 +202,7 @@ class Problem:
         self._fresh(k, np.setdiff1d(np.setdiff1d(node.index, kept), driven))
         if len(kept):
             known = np.setdiff1d(np.arange(len(step)), before.index)
-            constant = step[np.ix_(kept, known)] @ before.belief.mean[known]
+            constant = step[np.ix_(kept, known)] @ before.belief.mean[known] + shift[kept]
             own = noise[np.ix_(kept, kept)] + self._stray(node, kept)
             self._linear({k - 1: -step[kept], k: np.eye(len(step))[kept]}, constant, own)
         return anew
@@ -392,9 +392,10 @@ class Problem:
         self.graph.add(self._gtsam.CustomFactor(self._robust(noise), [k, begun], miss))
 
 
-def _transition(passage: Passage, belief: Belief, until_s: float) -> tuple[Floats, Floats]:
-    """Return how a belief's states move until an instant, sensors aside: matrix (n, n) and covariance of the noise.
+def _transition(passage: Passage, belief: Belief, until_s: float) -> tuple[Floats, Floats, Floats]:
+    """Return how a belief's states move until an instant, sensors aside.
 
+    That is ``step`` (n, n) times the states, linearised at their mean, plus ``shift`` (n,), and the noise's covariance.
     `predict` acts on rows of a covariance as it does on states: given the identity beside nothing, it leaves the matrix
     in its place, and the noise.
     """
@@ -407,6 +408,9 @@ def _transition(passage: Passage, belief: Belief, until_s: float) -> tuple[Float
     covariance[own, copy] = covariance[copy, own] = 1.0
     free = np.zeros(2 * n, bool)
     free[own] = belief.free
-    carried = replace(belief, mean=np.zeros(2 * n), covariance=covariance, free=free, inputs=inputs)
-    after = predict(carried, until_s, passage.follower.motion).covariance
-    return after[np.ix_(own, copy)], after[np.ix_(own, own)]
+    mean = np.zeros(2 * n)
+    mean[own] = belief.mean
+    carried = replace(belief, mean=mean, covariance=covariance, free=free, inputs=inputs)
+    after = predict(carried, until_s, passage.follower.motion)
+    step = after.covariance[np.ix_(own, copy)]
+    return step, after.mean[own] - step @ belief.mean, after.covariance[np.ix_(own, own)]
