@@ -6,7 +6,7 @@ File, live and simulation run this.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from itertools import chain
 
@@ -22,7 +22,7 @@ from sonofix.track.smooth import FixedLag, smooth
 from sonofix.two_way import exchange_epochs, replied
 
 
-def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
+def run(recording: Recording, rate_hz: float | None = None, held: Collection[str] = ()) -> Iterator[Step]:
     """Run a recording through the whole street.
 
     Parameters
@@ -30,6 +30,8 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
     recording : Recording
     rate_hz : float or None
         Estimates at this rate; None: one an epoch.
+    held : collection of str
+        What shall not calibrate itself, of `track.held.CALIBRATIONS`.
 
     Yields
     ------
@@ -38,10 +40,11 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
     Raises
     ------
     ValueError
-        If the recording holds neither samples, ranges nor exchanges, or cannot be sampled at the site's carrier.
+        If the recording holds neither samples, ranges nor exchanges, or cannot be sampled at the site's carrier, or
+        ``held`` names what nothing calibrates.
     """
     if recording.blocks is not None and recording.rate_hz is not None:
-        yield from _heard(recording, rate_hz)
+        yield from _heard(recording, rate_hz, held)
         return
     if recording.ranges is not None:
         epochs = iter(stated_epochs(recording.ranges, recording.site))
@@ -52,7 +55,7 @@ def run(recording: Recording, rate_hz: float | None = None) -> Iterator[Step]:
             "the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv nor exchanges.csv"
         )
     street = Street(recording.site, recording.tables.get("start"), rate_hz)
-    street.sense(recording.tables, _stated_pairs(recording))
+    street.sense(recording.tables, _stated_pairs(recording), held)
     for epoch in epochs:
         yield street.walk(epoch)
 
@@ -64,6 +67,7 @@ def smoothed(
     lag_s: float | None = None,
     graph: bool = False,
     on_epoch: Callable[[], None] = lambda: None,
+    held: Collection[str] = (),
 ) -> Iterator[Step]:
     """Smooth the track of a recording that was run: each instant with what was heard before it and after.
 
@@ -81,6 +85,8 @@ def smoothed(
         By a factor graph (gtsam).
     on_epoch : callable
         Is called for each epoch of each pass.
+    held : collection of str
+        As `run` was told.
 
     Yields
     ------
@@ -98,7 +104,7 @@ def smoothed(
             raise ValueError(f"lag: {lag_s:g} s; a smoother looks ahead by 0 s or more")
         if graph:
             raise ValueError("a graph smooths between a recording's ends; leave out either the graph or the lag")
-        yield from _lagging(recording, steps, rate_hz, lag_s)
+        yield from _lagging(recording, steps, rate_hz, lag_s, held)
         return
     kept = list(steps)
     if not kept:
@@ -107,7 +113,7 @@ def smoothed(
     if graph:
         from sonofix.track.graph import smooth as how
     tracks = how(
-        lambda: _beginning(recording, kept[0].ranges.sync_s),
+        lambda: _beginning(recording, kept[0].ranges.sync_s, held),
         [(step.ranges, step.fixes) for step in kept],
         rate_hz,
         on_epoch=on_epoch,
@@ -116,12 +122,14 @@ def smoothed(
         yield replace(step, estimates=estimates)
 
 
-def _lagging(recording: Recording, steps: Iterable[Step], rate_hz: float | None, lag_s: float) -> Iterator[Step]:
+def _lagging(
+    recording: Recording, steps: Iterable[Step], rate_hz: float | None, lag_s: float, held: Collection[str]
+) -> Iterator[Step]:
     """Smooth steps while they come."""
     waiting: deque[Step] = deque()
     lag: FixedLag | None = None
     for step in steps:
-        lag = lag or FixedLag(_beginning(recording, step.ranges.sync_s), lag_s, rate_hz)
+        lag = lag or FixedLag(_beginning(recording, step.ranges.sync_s, held), lag_s, rate_hz)
         waiting.append(step)
         for estimates in lag.take((step.ranges, step.fixes)):
             yield replace(waiting.popleft(), estimates=estimates)
@@ -129,10 +137,10 @@ def _lagging(recording: Recording, steps: Iterable[Step], rate_hz: float | None,
         yield replace(waiting.popleft(), estimates=estimates)
 
 
-def _beginning(recording: Recording, time_s: float) -> Follower:
+def _beginning(recording: Recording, time_s: float, held: Collection[str]) -> Follower:
     """Return a follower of a recording as `run` begins with one at the first epoch."""
     street = Street(recording.site, recording.tables.get("start"))
-    street.sense(recording.tables, _stated_pairs(recording))
+    street.sense(recording.tables, _stated_pairs(recording), held)
     street.begin(time_s)
     return street.follower
 
@@ -152,7 +160,7 @@ def _stated_pairs(recording: Recording) -> tuple[tuple[str, str], ...] | None:
     return tuple(pair for b, m, reply, ear in there for pair in ((b.id, m.id), (reply.id, ear.id)))
 
 
-def _heard(recording: Recording, rate_hz: float | None) -> Iterator[Step]:
+def _heard(recording: Recording, rate_hz: float | None, held: Collection[str]) -> Iterator[Step]:
     """Feed a receiver block by block; tell with the last step if the capture ended before its header says."""
     site, sample_rate_hz, blocks = recording.site, recording.rate_hz, recording.blocks
     assert sample_rate_hz is not None
@@ -162,7 +170,7 @@ def _heard(recording: Recording, rate_hz: float | None) -> Iterator[Step]:
         receiver = PeerReceiver(site, sample_rate_hz, waveforms, start, rate_hz)
     else:
         receiver = Receiver(site, sample_rate_hz, waveforms, recording.sync_s, start, rate_hz)
-    receiver.sense(recording.tables)
+    receiver.sense(recording.tables, held)
     count, last = 0, None
 
     def steps() -> Iterator[Step]:

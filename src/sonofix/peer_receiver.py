@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -58,9 +58,9 @@ class PeerReceiver:
         self._period_s, self._opens_s = site.schedule.period_s, min(b.offset_s for b in site.coded_beacons)
         self._epoch = 0
 
-    def sense(self, tables: Mapping[str, Table]) -> None:
+    def sense(self, tables: Mapping[str, Table], held: Collection[str] = ()) -> None:
         """Take in what robots' own sensors told, as `Street.sense` does."""
-        self._street.sense(tables)
+        self._street.sense(tables, held=held)
 
     def feed(self, block: NDArray[np.float32]) -> Iterator[Step]:
         """Take in samples (n, channels), full scale ±1, and yield what they complete."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 
@@ -103,9 +103,9 @@ class Receiver:
         self._heard_last = 0
         self._agility_mps2 = 1.0
 
-    def sense(self, tables: Mapping[str, Table]) -> None:
+    def sense(self, tables: Mapping[str, Table], held: Collection[str] = ()) -> None:
         """Take in what vehicles' own sensors told, as `Street.sense` does."""
-        self._street.sense(tables)
+        self._street.sense(tables, held=held)
 
     def heard_as(self, emitter: str) -> str:
         """Beacon that an emitter is listened for as where nothing is predicted: the first of its code."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step, Table
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, estimate, predict
 from sonofix.track.follow import Follower
+from sonofix.track.held import AIR
 from sonofix.track.inputs import gather
 
 
@@ -27,14 +28,20 @@ class Street:
         self._start = start
         self._written_s: float | None = None
 
-    def sense(self, tables: Mapping[str, Table], stated: tuple[tuple[str, str], ...] | None = None) -> None:
+    def sense(
+        self,
+        tables: Mapping[str, Table],
+        stated: tuple[tuple[str, str], ...] | None = None,
+        held: Collection[str] = (),
+    ) -> None:
         """Let what vehicles' own sensors and a thermometer tell enter, each row at its time; before the first epoch.
 
-        ``stated``: pairs (emitter, receiver) whose ranges come from others, with errors of their own.
+        ``stated``: pairs (emitter, receiver) whose ranges come from others, with errors of their own. ``held``: what
+        shall not calibrate itself (`track.held.CALIBRATIONS`).
         """
-        self.air = SoundSpeed(thermometer(self.site, tables.get("temperature")))
+        self.air = SoundSpeed(thermometer(self.site, tables.get("temperature")), learns=AIR not in held)
         inputs = gather(self.site, tables, stated)
-        self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs)
+        self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs, held)
 
     def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
         """Take in the ranges of one epoch."""

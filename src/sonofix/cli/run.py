@@ -39,6 +39,14 @@ def run(
     graph: Annotated[
         bool, typer.Option("--graph", help="Smooth by a factor graph (needs gtsam: the extra graph).")
     ] = False,
+    hold: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="What shall not calibrate itself: sound-speed, clock-drift, odometry-scale, odometry-bias, "
+            "step-length, step-heading, gyro-bias, range-scale, range-bias or pair-bias; may be given several times.",
+        ),
+    ] = None,
 ) -> None:
     """Turn a recording into ranges, fixes, a track and a picture.
 
@@ -47,12 +55,17 @@ def run(
     sonofix run FOLDER --smooth         the best track afterwards, by all of the recording
     sonofix run FOLDER --lag 5          the same on the way, five seconds late
     sonofix run FOLDER --smooth --rate 20
+    sonofix run FOLDER --hold odometry-scale --hold range-bias
     """
+    if hold:
+        from sonofix.track.held import places
+
+        places(hold, None)
     if graph:
         require_gtsam()
         if lag is not None:
             raise ValueError("--graph smooths a whole recording, --lag looks ahead by some seconds: leave out either")
-    run_folder(recording, out or recording / "out", plot, rate, smooth or graph, lag, graph)
+    run_folder(recording, out or recording / "out", plot, rate, smooth or graph, lag, graph, tuple(hold or ()))
 
 
 def require_gtsam() -> None:
@@ -77,6 +90,7 @@ def run_folder(
     smooth: bool = False,
     lag_s: float | None = None,
     graph: bool = False,
+    held: tuple[str, ...] = (),
 ) -> None:
     """Run a recording folder, write everything to `out`, and print the summary.
 
@@ -87,7 +101,7 @@ def run_folder(
     RecordingError
         With all mistakes of the recording, or where `out` cannot be written to.
     ValueError
-        If the recording holds no epoch.
+        If the recording holds no epoch, or ``held`` names what nothing calibrates.
     Stopped
         After Ctrl-C, outputs closed.
     """
@@ -103,16 +117,16 @@ def run_folder(
         with progress_bar() as bar:
             watched, on_step = _watched(recording, bar)
             stopped: list[bool] = []
-            found = _heeded(flow.run(watched, rate_hz), None if lag_s is None else stopped)
+            found = _heeded(flow.run(watched, rate_hz, held), None if lag_s is None else stopped)
             if lag_s is not None:
-                found = flow.smoothed(recording, found, rate_hz, lag_s)
+                found = flow.smoothed(recording, found, rate_hz, lag_s, held=held)
             keep = steps.append if whole else sample.add
             files.write_run(out, _seen(found, tally.add, keep, on_step), recording.site)
             if stopped:
                 raise KeyboardInterrupt
             if whole and steps:
                 on_epoch = _smoothing(bar, len(steps))
-                steps = list(flow.smoothed(recording, steps, rate_hz, graph=graph, on_epoch=on_epoch))
+                steps = list(flow.smoothed(recording, steps, rate_hz, graph=graph, on_epoch=on_epoch, held=held))
                 files.write_track(out, steps, recording.site)
     except KeyboardInterrupt:
         kept = f"{out} holds the first {counted(tally.epochs, 'epoch')}" if tally.epochs else "nothing was kept"

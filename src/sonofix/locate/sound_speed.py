@@ -74,11 +74,12 @@ def thermometer(site: Site, table: Table | None) -> Thermometer | None:
 class SoundSpeed:
     """Follows the sound speed of one run; ranges whose epochs take theirs as it is pass through untouched.
 
-    ``warmth`` is what a thermometer tells on the way; None: the air is as the site states it.
+    ``warmth`` is what a thermometer tells on the way; None: the air is as the site states it. Unless it ``learns``,
+    that is taken as it is.
     """
 
-    def __init__(self, warmth: Thermometer | None = None) -> None:
-        self._warmth = warmth
+    def __init__(self, warmth: Thermometer | None = None, learns: bool = True) -> None:
+        self._warmth, self._learns = warmth, learns
         self._belief: _Belief | None = None
         self._last_mps: float | None = None
         self._told_mps: float | None = None
@@ -115,7 +116,9 @@ class SoundSpeed:
         if self._warmth is not None:
             self._last_mps = self._warmth.at(epoch.sync_s)
             epoch = with_sound_speed(epoch, self._last_mps, epoch.sound_speed_sd_mps)
-        prior = self._prior(epoch, solve)
+        if not self._learns:
+            epoch = with_sound_speed(epoch, epoch.sound_speed_mps, 0.0)
+        prior = self._prior(epoch, solve) if self._learns else None
         if prior is None:
             return epoch, solve(epoch), ()
         asked = with_sound_speed(epoch, *prior)

@@ -18,6 +18,7 @@ from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.track import stated
 from sonofix.track.anchor import lift
 from sonofix.track.belief import Belief, Motion, begin_sensors, lift_anchors, loosen, place
+from sonofix.track.held import hold
 from sonofix.track.rival import bare, heard
 
 OUTDONE = 15.0
@@ -77,6 +78,7 @@ def apart(belief: Belief, found: Fix, arm: Floats) -> Alone | None:
     mean[own], covariance[own, :], covariance[:, own], free[own] = 0.0, 0.0, 0.0, False
     begin_sensors(inputs, covariance, free)
     stated.begin(mean, covariance, free, inputs.range_slot, inputs.known_sd_m)
+    hold(covariance, belief.held, free)
     return Alone(
         replace(begun, mean=mean, covariance=covariance, free=free, trust=trust.anew(), rough=None, heeded=False)
     )

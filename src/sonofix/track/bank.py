@@ -128,6 +128,11 @@ class Bank:
         self._covariance = np.zeros((len(decades), STATES, STATES))
         self._now_s: float | None = None
         self._heard: list[tuple[float, Floats, Floats, float, float, float]] = []
+        slot = int(inputs.wheel_slot[vehicle])
+        wander = (wheels.SCALE_PSD * belief.free[slot + 3], wheels.BIAS_PSD * belief.free[slot + 4])
+        self._constants = np.array(
+            [wheels.CREEP_PSD, wheels.SLIP_M, wheels.TWIST_PSD, wheels.TWIST_M, wheels.TWIST_RAD, *wander]
+        )
 
     @property
     def factors(self) -> Floats:
@@ -190,10 +195,6 @@ class Bank:
 
     def _go(self, until_s: float) -> None:
         """Go along all arcs told until an instant, and hear what was heard on them."""
-        constants = np.array([
-            wheels.CREEP_PSD, wheels.SLIP_M, wheels.TWIST_PSD, wheels.TWIST_M, wheels.TWIST_RAD,
-            wheels.SCALE_PSD, wheels.BIAS_PSD,
-        ])  # fmt: skip
         now_s = self._now_s if self._now_s is not None else until_s
         first, last = np.searchsorted(self._end_s, [now_s, until_s], side="right")
         for row in range(int(first), int(last)):
@@ -208,7 +209,7 @@ class Bank:
                 part = min(max(time_s - now_s, 0.0), dt) / dt if dt > 0 else 0.0
                 if part > 0:
                     arc = part * self._arc[row, :3]
-                    drive(self._mean, self._covariance, self._factor, arc, constants)
+                    drive(self._mean, self._covariance, self._factor, arc, self._constants)
                     now_s = max(time_s, now_s)
                 if heard is not None:
                     _, other, arm, range_m, variance, freedom = heard

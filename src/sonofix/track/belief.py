@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numba
@@ -15,6 +16,7 @@ from sonofix.site import Site
 from sonofix.track import gyro, paired, stated, steps, wheels
 from sonofix.track.anchor import lift
 from sonofix.track.arc import bend, open_course
+from sonofix.track.held import hold, places
 from sonofix.track.inputs import GYRO, STEP, WHEELS, Inputs
 from sonofix.track.stated import Trust
 from sonofix.track.tilt import open_tilt, rock
@@ -94,6 +96,8 @@ class Belief:
         Until when each vehicle's odometry does not enter: it was pushed; None: that of all does.
     bends : bool (V,) or None
         Vehicles that drive in arcs: their velocity turns with them (`bend`); None: none do.
+    held : int64 (h,) or None
+        States that calibrate themselves, but are to stay as they began (`held.places`).
 
     While it is carried on to be smoothed, copies of earlier states stand before the clock (`chain.copied`), never free.
     """
@@ -111,6 +115,7 @@ class Belief:
     heeded: bool = True
     deaf_s: Floats | None = None
     bends: NDArray[np.bool_] | None = None
+    held: NDArray[np.int64] | None = None
 
     def tilts(self, vehicle: int) -> float:
         """Deviation of a vehicle's roll and pitch as it was before anything was heard; 0: it stands upright."""
@@ -170,8 +175,8 @@ def lift_anchors(
         lift(mean, covariance, free, int(inputs.gyro_slot[vehicle]), 1)
 
 
-def blank(site: Site, inputs: Inputs | None = None) -> Belief:
-    """Return the belief before anything was heard."""
+def blank(site: Site, inputs: Inputs | None = None, held: Iterable[str] = ()) -> Belief:
+    """Return the belief before anything was heard; ``held`` are names of `held.CALIBRATIONS`."""
     n = SIZE * len(site.vehicles) + (inputs.size if inputs else 0) + 2
     mean, covariance, free = np.zeros(n), np.zeros((n, n)), np.zeros(n, bool)
     for i, vehicle in enumerate(site.vehicles):
@@ -185,7 +190,10 @@ def blank(site: Site, inputs: Inputs | None = None) -> Belief:
     trust = stated.trust(len(inputs.pairs)) if inputs is not None and inputs.range_slot >= 0 else None
     placed = np.zeros(len(site.vehicles), bool)
     bends = np.array([vehicle.motion == "constant-turn" for vehicle in site.vehicles], bool)
-    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilting(site), trust=trust, bends=bends)
+    kept = places(held, inputs)
+    hold(covariance, kept, free)
+    tilts = tilting(site)
+    return Belief(0.0, mean, covariance, free, placed, inputs, tilt_sd_rad=tilts, trust=trust, bends=bends, held=kept)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -248,6 +256,7 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     inputs, now_s = belief.inputs, belief.time_s
     if inputs is None:
         age(mean, covariance, free, belief.placed, bends, densities, float(dt))
+        hold(covariance, belief.held)
         _rock(belief, mean, covariance, motion, float(dt))
         return replace(belief, time_s=time_s, mean=mean, covariance=covariance)
     free = free.copy()
@@ -266,6 +275,7 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
                 gyro.wander(covariance, free, vehicle, int(inputs.gyro_slot[vehicle]), until_s - now_s)
         if belief.trust is not None:
             stated.wander(mean, covariance, inputs.range_slot, belief.trust, until_s - now_s)
+        hold(covariance, belief.held)
         if row is not None and belief.placed[inputs.vehicle[row]]:
             about = None if belief.about is None else belief.near(belief.about.row[row], mean)
             _sense(mean, covariance, free, belief, row, about)
@@ -346,6 +356,7 @@ def place(belief: Belief, vehicle: int, fix: Fix, arm: Floats, tilt_pace_radps: 
         mean[clock] = [fix.clock_offset_m or 0.0, 0.0]
         covariance[-1, -1] = (CLOCK_SPEED_SD * SOUND_SPEED_MPS) ** 2
         free[clock] = True
+        hold(covariance, belief.held, free)
     index = [names[state] for state in fix.states]
     covariance[np.ix_(index, index)] = fix.covariance
     free[index] = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from sonofix.track.belief import (
     unplaced,
 )
 from sonofix.track.course import Course
+from sonofix.track.held import hold
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
@@ -69,15 +71,22 @@ class Follower:
         The clock offset is another in every epoch (a sounding vehicle on its own clock).
     inputs : Inputs or None
         What the vehicles' own sensors tell of their motion.
+    held : iterable of str
+        What shall not calibrate itself, of `held.CALIBRATIONS`.
     """
 
     def __init__(
-        self, site: Site, motion: Motion | None = None, free_running: bool = False, inputs: Inputs | None = None
+        self,
+        site: Site,
+        motion: Motion | None = None,
+        free_running: bool = False,
+        inputs: Inputs | None = None,
+        held: Iterable[str] = (),
     ) -> None:
         self.site = site
         self.motion = motion or Motion()
         self.free_running = free_running
-        self.belief = blank(site, inputs)
+        self.belief = blank(site, inputs, held)
         self._arms = open_arms(site)
         self._refused = np.zeros(len(site.vehicles), int)
         self._heard = np.zeros(len(site.vehicles), bool)
@@ -114,6 +123,7 @@ class Follower:
             trust, motion = replace(trust, sizes=sizes), replace(motion, acceleration_psd=float(sizes[3]))
         covariance = self.belief.covariance.copy()
         stated.open_pairs(covariance, inputs.range_slot, trust)
+        hold(covariance, self.belief.held)
         self.belief = replace(self.belief, covariance=covariance, trust=trust, rough=other.belief.rough)
         self.motion, self._banks, self._panel = motion, {}, None
         return self
@@ -265,6 +275,7 @@ class Follower:
         covariance[-2, -2] = 100.0**2
         covariance[-1, -1] = (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
         free[-2:] = True
+        hold(covariance, belief.held, free)
         self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
 
     def _loosen(self, before: Belief) -> None:

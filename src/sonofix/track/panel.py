@@ -20,6 +20,7 @@ from sonofix.geometry import SIZE, YAW
 from sonofix.records import Floats
 from sonofix.track import stated
 from sonofix.track.belief import Belief, Motion, drift
+from sonofix.track.held import hold
 from sonofix.track.tilt import step_of
 
 QUICK_M = (0.3, 1.0, 3.0)
@@ -231,9 +232,15 @@ class Panel:
             own[quick, quick] = quick_m**2
             own[where, where] += (PLACED * quick_m) ** 2
             own[speeds, speeds] += BEGUN_MPS**2
+        self._hold(belief)
         self._refused = np.zeros((count, n), np.int64)
         self._last_s = np.full(pairs, belief.time_s)
         self._now_s = belief.time_s
+
+    def _hold(self, belief: Belief) -> None:
+        """Leave what shall not calibrate itself as it began."""
+        if belief.held is not None:
+            hold(self._covariance, belief.held[belief.held >= 0], self._free)
 
     @property
     def begun(self) -> bool:
@@ -267,6 +274,7 @@ class Panel:
             len(inputs.pairs),
             stated.LASTING_S,
         )
+        self._hold(belief)
         self._now_s = belief.time_s
         derivative, offset, variance, pair = rows
         quick = inputs.range_slot + 2 + len(inputs.pairs) + pair

@@ -19,6 +19,7 @@ from sonofix.locate.search import mirror
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.track import stated
 from sonofix.track.belief import SIZE, Belief, Motion, loosen, place, predict
+from sonofix.track.held import hold
 from sonofix.track.update import update
 
 DECIDED = 10.0
@@ -123,6 +124,7 @@ def beside(belief: Belief, vehicle: int, found: Fix, arm: Floats) -> Rival | Non
     begun = loosen(place(bare(belief), vehicle, found, arm), vehicle)
     mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
     stated.begin(mean, covariance, free, belief.inputs.range_slot, belief.inputs.known_sd_m)
+    hold(covariance, belief.held, free)
     begun = replace(begun, mean=mean, covariance=covariance, free=free, trust=belief.trust.anew())
     return Rival(begun, vehicle, belief.time_s)
 

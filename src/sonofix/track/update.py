@@ -15,6 +15,7 @@ from sonofix.locate.noise import row_noise
 from sonofix.records import Floats, RangeEpoch
 from sonofix.track import paired, sound_rows, stated
 from sonofix.track.belief import Belief
+from sonofix.track.held import hold
 from sonofix.track.sound_rows import Peak
 
 GATE_SIGMA = 5.0
@@ -242,6 +243,7 @@ def _jumped(belief: Belief, pair: NDArray[np.int64], miss: Floats) -> Belief:
     covariance = belief.covariance.copy()
     at = stated.places(belief.inputs.range_slot, pair, len(belief.inputs.pairs))[0]
     covariance[at, at] += miss**2
+    hold(covariance, belief.held)
     return replace(belief, covariance=covariance)
 
 
