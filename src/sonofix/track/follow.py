@@ -20,6 +20,7 @@ from sonofix.track.belief import (
     Motion,
     blank,
     estimate,
+    lift_heading,
     loosen,
     place,
     predict,
@@ -69,6 +70,12 @@ class Follower:
         The clock offset is another in every epoch (a sounding vehicle on its own clock).
     inputs : Inputs or None
         What the vehicles' own sensors tell of their motion.
+
+    Attributes
+    ----------
+    belief : Belief
+    refuted : bool (V,)
+        Vehicles that are not, or do not head, as they were stated to start: ranges gainsaid it before they bore it out.
     """
 
     def __init__(
@@ -88,6 +95,8 @@ class Follower:
         self._pushed: Floats | None = None
         self._begun_s = np.full(len(site.vehicles), -np.inf)
         self._given = np.zeros(len(site.vehicles), bool)
+        self._stated = np.zeros(len(site.vehicles), bool)
+        self.refuted = np.zeros(len(site.vehicles), bool)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
         self._banks: dict[int, Bank] = {}
@@ -122,7 +131,7 @@ class Follower:
         """Place a vehicle at a pose known beforehand."""
         who = [v.id for v in self.site.vehicles].index(vehicle)
         known = self.site.vehicles[who].z_m is not None
-        self._given[who] = True
+        self._given[who] = self._stated[who] = True
         inputs = self.belief.inputs
         turns = bool(turning(self.site)[who]) or (inputs is not None and bool(inputs.headed[who]))
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -132,6 +141,13 @@ class Follower:
             replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns, self.motion.tilt_pace_radps
         )
         self.belief = set_out(self.belief)
+
+    def unstarted(self, vehicles: NDArray[np.bool_]) -> Follower:
+        """Return this follower, at its beginning, as if no start of these vehicles (V,) had been stated."""
+        for who in np.flatnonzero(vehicles).tolist():
+            self.belief = unplaced(self.belief, who)
+            self._given[who] = self._stated[who] = False
+        return self
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -163,7 +179,7 @@ class Follower:
         before = self.belief
         self.belief, used, _ = update(before, epoch, links, candidates & ~taken)
         if before.inputs is not None and len(before.inputs.time_s) and before.heeded:
-            used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
+            used = self._slipped(before, epoch, links, candidates & ~taken, used, events, ~self._tried(fixes))
         used |= taken
         if taken.any() or any(event.event in ("slip", "reset") for event in events):
             # a rival knows nothing of that
@@ -177,6 +193,7 @@ class Follower:
         self._doubt_wheels(before, epoch, links, candidates, events)
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
+        self._prove_start(fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
     def time_of(self, epoch: RangeEpoch) -> float:
@@ -202,15 +219,16 @@ class Follower:
         asked: NDArray[np.bool_],
         used: NDArray[np.bool_],
         events: list[Event],
+        asked_of: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Find the vehicle that moved without its own sensors noticing, where many ranges are refused.
+        """Find the vehicle, one of those ``asked_of``, that moved unnoticed by its sensors, where many ranges are refused.
 
         It is the one whose place, once opened, makes the epoch as a whole most likely; the epoch is then taken in anew.
         Returns the rows used.
         """
         refused = asked & ~used
         best: tuple[float, int, Belief] | None = None
-        for who in np.flatnonzero(before.placed).tolist():
+        for who in np.flatnonzero(before.placed & asked_of).tolist():
             own = asked & self._touches(links, who)
             if np.count_nonzero(refused & own) < max(2, np.count_nonzero(own) / 2):
                 continue
@@ -221,6 +239,11 @@ class Follower:
         if best is None:
             return used
         _, who, opened = best
+        if self._stated[who] and not turning(self.site)[who]:
+            # it may head as it was never borne out to
+            mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
+            lift_heading(mean, covariance, free, who)
+            opened, self._alone = replace(opened, mean=mean, covariance=covariance, free=free), None
         opened, again, _ = update(opened, epoch, links, asked, together=False)
         if np.count_nonzero(again) <= np.count_nonzero(used):
             return used
@@ -250,6 +273,21 @@ class Follower:
             self._given[who] = False
             self._rival = self._rival or beside(self.belief, who, fixes[who], self._arms[who])
             self._undecided[who] = self._rival is not None and self._rival.vehicle == who
+
+    def _tried(self, fixes: tuple[Fix, ...]) -> NDArray[np.bool_]:
+        """Whose stated start contests with a fix, or is about to (V,)."""
+        contests = self._given & np.array([found.status == "ok" for found in fixes])
+        return (contests & self._corrected) | (self._undecided & self._stated)
+
+    def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event]) -> None:
+        """Note whose stated start ranges gainsay before they have borne it out."""
+        for who in np.flatnonzero(self._stated).tolist():
+            told = {event.event for event in events if event.vehicle == self.site.vehicles[who].id}
+            if told & {"reset", "slip"}:
+                self.refuted[who], self._stated[who], self._given[who] = True, False, False
+            elif fixes[who].status == "ok" and not self._undecided[who]:
+                # a heading is borne out by sensors that it makes right (`_heed`)
+                self._given[who], self._stated[who] = False, self._judges_sensors
 
     def _clock(self, epoch: RangeEpoch, fixes: tuple[Fix, ...]) -> None:
         """Open the clock offset anew where nothing ties it to the last epoch's: a free-running source, or a start."""
@@ -305,9 +343,7 @@ class Follower:
     def _heed(self, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]) -> None:
         """Hear a vehicle's own sensors only as long as ranges that others state are not far likelier without them."""
         inputs, trust, now_s = self.belief.inputs, self.belief.trust, self.belief.time_s
-        if inputs is None or trust is None or not len(inputs.time_s) or len(self.belief.placed) != 1:
-            return
-        if self.free_running or not self.belief.placed[0] or not len(epoch):
+        if trust is None or not self._judges_sensors or not self.belief.placed[0] or not len(epoch):
             return
         if not self.belief.heeded:
             if self._silence.over(now_s):
@@ -317,17 +353,21 @@ class Follower:
         if self._alone is not None:
             self._alone = self._alone.take(now_s, self.motion, epoch, links, asked, trust.told)
         if self._alone is not None and self._alone.lost:
-            self._alone = unled(self.belief, bool(turning(self.site)[0]))
+            self._alone, self._stated[0] = unled(self.belief, bool(turning(self.site)[0])), False
         elif self._alone is None:
             self._alone = apart(self.belief, self._gathered(self.site.vehicles[0].id), self._arms[0])
         elif self._alone.won:
             self.belief = follows(self.belief, self._alone.belief)
             self._alone, self._rival, self._refused[0], self._undecided[0] = None, None, 0, False
-            silent_s = self._silence.begin(now_s)
             x, y, z = estimate(self.belief, self.site, 0, "fused").position_m
-            text = (
-                f"ranges gainsay its own sensors, unheard for {silent_s:g} s: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"
-            )
+            if self._stated[0] and inputs is not None and inputs.wheel_slot[0] >= 0:
+                # wheels are right only as the heading is that they began with: it is found anew
+                self.belief = replace(self.belief, heeded=True)
+                self._alone = unled(self.belief, bool(turning(self.site)[0]))
+                text = "ranges gainsay how it was stated to start"
+            else:
+                text = f"ranges gainsay its own sensors, unheard for {self._silence.begin(now_s):g} s"
+            text += f": placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"
             events.append(Event(now_s, self.site.vehicles[0].id, "reset", text))
 
     def _weigh(
@@ -371,9 +411,11 @@ class Follower:
             return used
         if rival is not None:
             rival, heard = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
-            self._rival = None if rival.lost or rival.won else rival
+            # a stated start that was not the likelier is not borne out, however alike both are by now
+            likelier = rival.won or (rival.lost and rival.ahead > 0.0 and bool((self._undecided & self._stated)[rival.vehicle]))
+            self._rival = None if rival.lost or likelier else rival
             self._undecided[rival.vehicle] &= self._rival is not None
-            if rival.won:
+            if likelier:
                 self.belief = follows(self.belief, rival.belief)
                 self._refused[rival.vehicle] = 0
                 x, y, z = estimate(self.belief, self.site, rival.vehicle, "fused").position_m
@@ -407,6 +449,13 @@ class Follower:
     def hidden(self) -> frozenset[int]:
         """Vehicles of which nothing is told yet: a second start may be true."""
         return frozenset(np.flatnonzero(self._undecided).tolist())
+
+    @property
+    def _judges_sensors(self) -> bool:
+        """Whether a track by ranges alone tells whether the sensors of the only vehicle are right."""
+        inputs = self.belief.inputs
+        sensed = inputs is not None and len(inputs.time_s) > 0 and len(self.belief.placed) == 1
+        return sensed and self._corrected and not self.free_running
 
     @property
     def _corrected(self) -> bool:
