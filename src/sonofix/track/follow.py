@@ -32,8 +32,8 @@ from sonofix.track.belief import (
 from sonofix.track.course import Course
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
-from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
-from sonofix.track.update import linear, strangeness, update
+from sonofix.track.rival import ASKED_S, TRIED_S, Rival, begun, beside, follows, image
+from sonofix.track.update import linear, strangeness, update, weighed_rows
 from sonofix.track.wheels import AS_EXPECTED
 
 PATIENCE = 3
@@ -51,6 +51,9 @@ AGILITY = (1e-3, 2.0)
 
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
+
+SLIPS = float(np.log(1e-3))
+"""Logarithm of how likely a slip is in an epoch."""
 
 FORGOTTEN_M = 1e4
 """Deviation at which nothing is left of a place: after an hour of silence, or where the clock was set."""
@@ -96,6 +99,8 @@ class Follower:
         self._begun_s = np.full(len(site.vehicles), -np.inf)
         self._given = np.zeros(len(site.vehicles), bool)
         self._stated = np.zeros(len(site.vehicles), bool)
+        self._mirrored = np.zeros(len(site.vehicles), bool)
+        self._since_s = np.inf
         self.refuted = np.zeros(len(site.vehicles), bool)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
@@ -143,9 +148,10 @@ class Follower:
         self.belief = set_out(self.belief)
 
     def unstarted(self, vehicles: NDArray[np.bool_]) -> Follower:
-        """Return this follower, at its beginning, as if no start of these vehicles (V,) had been stated."""
+        """Return this follower, at its beginning, without the start of these vehicles (V,) that was refuted."""
         for who in np.flatnonzero(vehicles).tolist():
             self.belief = unplaced(self.belief, who)
+            self._mirrored[who] = not self._given[who]
             self._given[who] = self._stated[who] = False
         return self
 
@@ -221,9 +227,10 @@ class Follower:
         events: list[Event],
         asked_of: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Find the vehicle, one of those ``asked_of``, that moved unnoticed by its sensors, where many ranges are refused.
+        """Find the vehicle that moved unnoticed by its own sensors, where many ranges are refused.
 
-        It is the one whose place, once opened, makes the epoch as a whole most likely; the epoch is then taken in anew.
+        It is the one of those ``asked_of`` (V,) whose place, once opened, makes the epoch as a whole most likely; the
+        epoch is then taken in anew. Ranges that others state may as well be outliers: a slip must be the likelier.
         Returns the rows used.
         """
         refused = asked & ~used
@@ -239,6 +246,11 @@ class Follower:
         if best is None:
             return used
         _, who, opened = best
+        if before.trust is not None:
+            stays = weighed_rows(before, epoch, links, asked)
+            moved = weighed_rows(opened, epoch, links, asked)
+            if moved + SLIPS < stays:
+                return used
         if self._stated[who] and not turning(self.site)[who]:
             # it may head as it was never borne out to
             mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
@@ -275,9 +287,9 @@ class Follower:
             self._undecided[who] = self._rival is not None and self._rival.vehicle == who
 
     def _tried(self, fixes: tuple[Fix, ...]) -> NDArray[np.bool_]:
-        """Whose stated start contests with a fix, or is about to (V,)."""
+        """Whose start contests with another, or is about to (V,): misfit is for that to judge."""
         contests = self._given & np.array([found.status == "ok" for found in fixes])
-        return (contests & self._corrected) | (self._undecided & self._stated)
+        return (contests & self._corrected) | self._undecided
 
     def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event]) -> None:
         """Note whose stated start ranges gainsay before they have borne it out."""
@@ -412,9 +424,12 @@ class Follower:
         if rival is not None:
             rival, heard = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
             # a stated start that was not the likelier is not borne out, however alike both are by now
-            likelier = rival.won or (rival.lost and rival.ahead > 0.0 and bool((self._undecided & self._stated)[rival.vehicle]))
+            tried = bool(self._undecided[rival.vehicle] and self._stated[rival.vehicle])
+            likelier = rival.won or (tried and rival.lost and rival.ahead > 0.0)
             self._rival = None if rival.lost or likelier else rival
             self._undecided[rival.vehicle] &= self._rival is not None
+            if rival.lost and rival.course is not None:
+                self._stated[rival.vehicle] = False
             if likelier:
                 self.belief = follows(self.belief, rival.belief)
                 self._refused[rival.vehicle] = 0
@@ -428,7 +443,8 @@ class Follower:
                 if self._rival is None and np.any(self._touches(links, who)):
                     found = self._gathered(self.site.vehicles[who].id)
                     young = self.belief.time_s - self._begun_s[who] < TRIED_S
-                    for other in (found, image(self.belief, who, links, found))[: 1 + young]:
+                    mirrored = image(self.belief.mean[SIZE * who :][:3], self.belief.free, who, links, found)
+                    for other in (found, mirrored)[: 1 + young]:
                         self._rival = self._rival or beside(self.belief, who, other, self._arms[who])
                     if young and self._rival is not None and self._rival.vehicle == who:
                         self._undecided[who] = True
@@ -471,6 +487,7 @@ class Follower:
 
     def _gather(self, epoch: RangeEpoch) -> None:
         if len(epoch):
+            self._since_s = min(self._since_s, epoch.sync_s)
             self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
 
     def _place(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> NDArray[np.bool_]:
@@ -485,6 +502,9 @@ class Follower:
             poor = found.status in ("too-few", "ambiguous") and not self.free_running
             if (poor or again) and np.any(self._touches(links, who)):
                 start = self._gathered(found.vehicle)
+            two = None if lost else self._twofold(who, start, links)
+            if two is not None:
+                start = two[int(self._mirrored[who])]
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
@@ -499,10 +519,32 @@ class Follower:
                     taken |= start.used  # with errors open, the very same ranges would only blur their fix
             else:
                 taken |= start.used if start is found else self._touches(links, who)
+            if two is not None:
+                other = two[1 - int(self._mirrored[who])]
+                self._rival = begun(self.belief, who, other, self._arms[who], Course())
+                self._undecided[who], self._stated[who] = True, not self._mirrored[who]
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
             events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
         return taken
+
+    def _twofold(self, who: int, found: Fix, links: Links) -> tuple[Fix, Fix] | None:
+        """Return the two places where a vehicle with odometry may be by all ranges of some seconds, if that tells them.
+
+        Beacons on a line leave its mirror image open. A vehicle's turns are the other way round there.
+        """
+        inputs, place_m = self.belief.inputs, found.mirror_m
+        if inputs is None or not self._corrected or self._rival is not None or found.status != "ambiguous":
+            return None
+        if place_m is None or self.site.vehicles[who].z_m is None or inputs.wheel_slot[who] < 0:
+            return None
+        heard = {pair for epoch in self._recent for pair in zip(epoch.emitter, epoch.receiver, strict=True)}
+        early = self._recent[-1].sync_s < self._since_s + GATHER_S
+        if turning(self.site)[who] or (early and len(heard) < len(inputs.pairs)):
+            return None  # others may yet be heard
+        one = replace(found, status="ok", position_m=place_m, covariance=np.eye(2), states=("x", "y"))
+        other = image(place_m, self.belief.free, who, links, one)
+        return None if other.position_m is None else (one, other)
 
     def _contradicted(self, who: int, found: Fix) -> bool:
         """Whether a fix with ranges to check by says that a vehicle is not at all where its track has it."""

@@ -130,7 +130,8 @@ def settle(
             anew = settle(partial(_unstarted, begin, passage.follower.refuted), heard, rate_hz, passes, on_epoch, rows)
             if anew.marks:
                 return anew
-        if not left or not passage.marks:
+        if not left or not passage.marks or passage.follower.hidden:
+            # of two starts that are not told apart none is linearised about
             return passage
         before = passage.follower
         following = guided(passage, () if guide is None else guide.openings)
