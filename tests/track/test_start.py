@@ -40,7 +40,7 @@ class Outing:
     ) -> None:
         times = np.arange(0.0, seconds + 0.1, 0.1)
         self._site, self._turn_radps = site, turn_radps
-        self._pairs = tuple((b.id, m.id) for b in site.beacons for m in site.microphones)
+        self.pairs = tuple((b.id, m.id) for b in site.beacons for m in site.microphones)
         self._table = Table(
             {
                 "time_s": times,
@@ -49,10 +49,10 @@ class Outing:
             },
             {},
         )
-        self._start = None
+        self.start = None
         if off is not None:
             x, y, yaw = BEGIN + off
-            self._start = Table({"x_m": np.array([x]), "y_m": np.array([y]), "yaw_rad": np.array([yaw])}, {})
+            self.start = Table({"x_m": np.array([x]), "y_m": np.array([y]), "yaw_rad": np.array([yaw])}, {})
         street = self._street()
         self.heard: list[Heard] = []
         self.told: list[tuple[Estimate, ...]] = []
@@ -60,14 +60,14 @@ class Outing:
         for at_s in np.arange(0.05, seconds, PERIOD_S).tolist():
             x, y, _ = pose(at_s, turn_radps)
             epoch = make_epoch(site, Drive((x, y, 0.0)), sd_m=SD_M, rng=rng, stated=True)
-            step = street.walk(replace(epoch, time_s=np.full(len(self._pairs), at_s), sync_s=at_s))
+            step = street.walk(replace(epoch, time_s=np.full(len(self.pairs), at_s), sync_s=at_s))
             self.heard.append((step.ranges, step.fixes))
             self.told.append(step.estimates)
             self.events += step.events
 
     def _street(self) -> Street:
-        street = Street(self._site, self._start)
-        street.sense({"odometry": self._table}, stated=self._pairs)
+        street = Street(self._site, self.start)
+        street.sense({"odometry": self._table}, stated=self.pairs)
         return street
 
     def begin(self) -> Follower:
@@ -146,3 +146,28 @@ def test_on_a_straight_way_two_beacons_tell_nothing(rng: np.random.Generator) ->
     outing = Outing(WALL_SITE, None, rng, seconds=12.0, turn_radps=0.0)
     assert not any(outing.told)
     assert not any(smooth(outing.begin, outing.heard))
+
+
+@pytest.mark.parametrize("pushed", [False, True])
+def test_outliers_are_no_slip_and_a_push_is(pushed: bool, rng: np.random.Generator) -> None:
+    """One range in ten is 5 m long; four are heard at once, so in one epoch of twenty half of them gainsay wheels."""
+    site, seconds = make_site(HALL[:4], level_m=0.0), 30.0
+    outing = Outing(site, (0.0, 0.0, 0.0), rng, seconds=0.0)
+    times = np.arange(0.0, seconds + 0.1, 0.1)
+    turns = TURN_RADPS + 0.01 * rng.standard_normal(len(times))
+    speeds = SPEED_MPS + 0.02 * rng.standard_normal(len(times))
+    street = Street(site, outing.start)
+    odometry = Table({"time_s": times, "v_mps": speeds, "yaw_rate_radps": turns}, {})
+    street.sense({"odometry": odometry}, stated=outing.pairs)
+    slips, miss = [], []
+    for at_s in np.arange(0.05, seconds, PERIOD_S).tolist():
+        place = pose(at_s)[:2] + ([1.2, 1.2] if pushed and at_s > 20.0 else [0.0, 0.0])
+        epoch = make_epoch(site, Drive((*place, 0.0)), sd_m=SD_M, rng=rng, stated=True)
+        late = 5.0 * (rng.random(4) < 0.1)
+        heard = replace(epoch, time_s=np.full(4, at_s), sync_s=at_s, range_m=epoch.range_m + late)
+        step = street.walk(heard)
+        slips += [e.time_s for e in step.events if e.event in ("slip", "reset")]
+        miss += [np.hypot(*(e.position_m[:2] - place)) for e in step.estimates if not 20.0 < at_s < 22.0]
+    assert len(slips) == pushed
+    assert all(20.0 < at_s < 21.0 for at_s in slips)
+    assert max(miss) < 0.5

@@ -102,6 +102,10 @@ def update(
     if trust is not None:
         # the noise of others' ranges has heavy tails: what is far off counts less before it counts for nothing
         trust, larger = trust.weighed(pair, miss, spread, noise.diagonal())
+        if np.count_nonzero(near) > 2 and not with_rates:
+            some = np.ix_(near, near)
+            expected = crossed[near] @ derivative[near].T + noise[some]
+            larger[near] = trust.together(miss[near], expected, noise[some].diagonal(), larger[near])
         noise[np.diag_indices(len(rows))] *= larger
         belief = replace(belief, trust=trust)
     if not near.any():
