@@ -288,16 +288,19 @@ class Follower:
 
     def _tried(self, fixes: tuple[Fix, ...]) -> NDArray[np.bool_]:
         """Whose start contests with another, or is about to (V,): misfit is for that to judge."""
-        contests = self._given & np.array([found.status == "ok" for found in fixes])
+        fixed = {found.vehicle for found in fixes if found.status == "ok"}
+        contests = self._given & np.array([vehicle.id in fixed for vehicle in self.site.vehicles], bool)
         return (contests & self._corrected) | self._undecided
 
     def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event]) -> None:
         """Note whose stated start ranges gainsay before they have borne it out."""
+        fixed = {found.vehicle for found in fixes if found.status == "ok"}
         for who in np.flatnonzero(self._stated).tolist():
-            told = {event.event for event in events if event.vehicle == self.site.vehicles[who].id}
+            name = self.site.vehicles[who].id
+            told = {event.event for event in events if event.vehicle == name}
             if told & {"reset", "slip"}:
                 self.refuted[who], self._stated[who], self._given[who] = True, False, False
-            elif fixes[who].status == "ok" and not self._undecided[who]:
+            elif name in fixed and not self._undecided[who]:
                 # a heading is borne out by sensors that it makes right (`_heed`)
                 self._given[who], self._stated[who] = False, self._judges_sensors
 

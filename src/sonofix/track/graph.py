@@ -307,7 +307,7 @@ class Problem:
             self._difference(*difference, noise)
 
     def _believed(self, k: int, anew: NDArray[np.bool_]) -> dict[int, tuple[Floats, Floats | None]]:
-        """Return what odometry tells by a node of vehicles that it carries, and the noise of its arc; None: none
+        """Return what odometry tells by a node of vehicles that it carries, with the noise of its arc, if any.
 
         As in the filter, nothing else ties such a vehicle to the node before.
         """
