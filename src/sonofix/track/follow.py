@@ -251,15 +251,18 @@ class Follower:
             moved = weighed_rows(opened, epoch, links, asked)
             if moved + SLIPS < stays:
                 return used
-        if self._stated[who] and not turning(self.site)[who]:
-            # it may head as it was never borne out to
+        inputs, unproven = before.inputs, bool(self._stated[who])
+        if unproven and inputs is not None and inputs.wheel_slot[who] >= 0 and not turning(self.site)[who]:
+            # it may not head as was stated; the way driven will tell
             mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
             lift_heading(mean, covariance, free, who)
-            opened, self._alone = replace(opened, mean=mean, covariance=covariance, free=free), None
+            opened = replace(opened, mean=mean, covariance=covariance, free=free)
         opened, again, _ = update(opened, epoch, links, asked, together=False)
         if np.count_nonzero(again) <= np.count_nonzero(used):
             return used
         self.belief = opened
+        if unproven:
+            self._alone = None  # what it gathered was against that heading
         apart = np.hypot(*(self.belief.pose()[who, :2] - before.pose()[who, :2]))
         text = f"{np.count_nonzero(refused)} ranges disagreed: {apart:.2f} m from where its own sensors had it"
         events.append(Event(before.time_s, self.site.vehicles[who].id, "slip", text))
