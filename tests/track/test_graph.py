@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from locate.made_epochs import HALL, Drive, make_epoch, make_site
+from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of
 from sonofix.records import Estimate
 from sonofix.track import graph
 from sonofix.track.follow import Follower
@@ -84,6 +84,28 @@ def test_odometry_whose_heading_is_found_on_the_way(rng: np.random.Generator) ->
 
     epochs = [make_epoch(site, Drive(way(t)), t, sd_m=0.05, rng=rng) for t in 0.05 + PERIOD_S * np.arange(38)]
     check(lambda: Follower(site, inputs=inputs), heard_of(site, epochs))
+
+
+@pytest.mark.usefixtures("gtsam")
+def test_odometry_tells_by_rows_a_second_apart_and_the_very_last(rng: np.random.Generator) -> None:
+    """Ranges have ended by then but for one, which tells of half the place."""
+    site = make_site(HALL, level_m=1.1)
+    times = np.arange(-1.0, 16.0, 1.0)
+    inputs = gather(site, {"odometry": odometry(np.column_stack([times, 0.6 + 0 * times, 0.2 + 0 * times]))})
+
+    def way(t: float) -> tuple[float, float, float]:
+        return (5.0 + 3.0 * np.sin(0.2 * t), 4.0 - 3.0 * np.cos(0.2 * t), 1.1)
+
+    moments = [*(0.05 + PERIOD_S * np.arange(28)), 15.02]
+    epochs = [make_epoch(site, Drive(way(t)), t, sd_m=0.05, rng=rng) for t in moments]
+    epochs[-1] = rows_of(epochs[-1], [0])
+
+    def begin() -> Follower:
+        follower = Follower(site, inputs=inputs)
+        follower.start("v", -0.5, np.array(way(-0.5)), -0.1)
+        return follower
+
+    check(begin, heard_of(site, epochs))
 
 
 @pytest.mark.usefixtures("gtsam")

@@ -220,3 +220,29 @@ def test_after_silence_the_track_is_where_ranges_say(gap_s: float, rng: np.rando
                 assert off[-1] < 5 * np.hypot(got.sd("x") or 0.0, got.sd("y") or 0.0)
     assert len(off) > 15
     assert np.median(off) < 0.05
+
+
+def test_rows_far_off_by_what_others_say_weigh_little(rng: np.random.Generator) -> None:
+    """Four rows of a place known to 2 m: the one that is 5 m late passes by itself, and would take the place along."""
+    known = stated.trust(4)
+    ways = np.array([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
+    noise = np.full(4, 0.1**2)
+    expected = 2.0**2 * ways @ ways.T + np.diag(noise)
+    for late in range(4):
+        miss = ways @ [0.5, -1.0] + 0.1 * rng.standard_normal(4)
+        miss[late] += 5.0
+        alone = known.weighed(np.arange(4), miss, expected.diagonal(), noise)[1]
+        larger = known.together(miss, expected, noise, alone)
+        gain = np.linalg.solve(expected + np.diag((larger - 1.0) * noise), 2.0**2 * ways).T
+        assert np.hypot(*(gain @ miss - [0.5, -1.0])) < 0.5
+        assert np.argmax(larger) == late
+        straight = np.linalg.solve(expected + np.diag((alone - 1.0) * noise), 2.0**2 * ways).T
+        assert np.hypot(*(straight @ miss - [0.5, -1.0])) > 1.0
+
+
+def test_rows_that_agree_weigh_as_by_themselves(rng: np.random.Generator) -> None:
+    known, ways, noise = stated.trust(4), rng.standard_normal((4, 2)), np.full(4, 0.1**2)
+    expected = 2.0**2 * ways @ ways.T + np.diag(noise)
+    miss = ways @ [0.5, -1.0]
+    alone = known.weighed(np.arange(4), miss, expected.diagonal(), noise)[1]
+    np.testing.assert_allclose(known.together(miss, expected, noise, alone), alone, rtol=0.35)

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import YAW, Links
+from sonofix.geometry import Links
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.track import stated
-from sonofix.track.anchor import lift
-from sonofix.track.belief import Belief, Motion, begin_sensors, lift_anchors, loosen, place
+from sonofix.track.belief import Belief, Motion, begin_sensors, lift_anchors, lift_heading, loosen, place
 from sonofix.track.held import hold
 from sonofix.track.rival import bare, heard
 
@@ -90,8 +89,7 @@ def unled(belief: Belief, turns: bool) -> Alone:
     mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
     lift_anchors(belief.inputs, 0, mean, covariance, free)
     if not turns:
-        lift(mean, covariance, free, YAW, 1)
-        lift(mean, covariance, free, YAW + 4, 1)
+        lift_heading(mean, covariance, free, 0)
     return Alone(replace(begun, mean=mean, covariance=covariance, free=free, heeded=False))
 
 

@@ -175,6 +175,12 @@ def lift_anchors(
         lift(mean, covariance, free, int(inputs.gyro_slot[vehicle]), 1)
 
 
+def lift_heading(mean: Floats, covariance: Floats, free: NDArray[np.bool_], vehicle: int) -> None:
+    """Take a vehicle's heading and how fast it turns away, in place: they are not known on this track."""
+    lift(mean, covariance, free, SIZE * vehicle + YAW, 1)
+    lift(mean, covariance, free, SIZE * vehicle + YAW + 4, 1)
+
+
 def blank(site: Site, inputs: Inputs | None = None, held: Iterable[str] = ()) -> Belief:
     """Return the belief before anything was heard; ``held`` are names of `held.CALIBRATIONS`."""
     n = SIZE * len(site.vehicles) + (inputs.size if inputs else 0) + 2

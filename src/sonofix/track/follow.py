@@ -21,6 +21,7 @@ from sonofix.track.belief import (
     Motion,
     blank,
     estimate,
+    lift_heading,
     loosen,
     place,
     predict,
@@ -33,8 +34,8 @@ from sonofix.track.course import Course
 from sonofix.track.held import hold
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
-from sonofix.track.rival import ASKED_S, TRIED_S, Rival, beside, follows, image
-from sonofix.track.update import linear, strangeness, update
+from sonofix.track.rival import ASKED_S, TRIED_S, Rival, begun, beside, follows, image
+from sonofix.track.update import linear, strangeness, update, weighed_rows
 from sonofix.track.wheels import AS_EXPECTED
 
 PATIENCE = 3
@@ -52,6 +53,9 @@ AGILITY = (1e-3, 2.0)
 
 SLIPPED_M = 1.0
 """How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
+
+SLIPS = float(np.log(1e-3))
+"""Logarithm of how likely a slip is in an epoch."""
 
 FORGOTTEN_M = 1e4
 """Deviation at which nothing is left of a place: after an hour of silence, or where the clock was set."""
@@ -73,6 +77,12 @@ class Follower:
         What the vehicles' own sensors tell of their motion.
     held : iterable of str
         What shall not calibrate itself, of `held.CALIBRATIONS`.
+
+    Attributes
+    ----------
+    belief : Belief
+    refuted : bool (V,)
+        Vehicles that are not, or do not head, as they were stated to start: ranges gainsaid it before they bore it out.
     """
 
     def __init__(
@@ -97,6 +107,10 @@ class Follower:
         self._pushed: Floats | None = None
         self._begun_s = np.full(len(site.vehicles), -np.inf)
         self._given = np.zeros(len(site.vehicles), bool)
+        self._stated = np.zeros(len(site.vehicles), bool)
+        self._mirrored = np.zeros(len(site.vehicles), bool)
+        self._since_s = np.inf
+        self.refuted = np.zeros(len(site.vehicles), bool)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
         self._banks: dict[int, Bank] = {}
@@ -132,7 +146,7 @@ class Follower:
         """Place a vehicle at a pose known beforehand."""
         who = [v.id for v in self.site.vehicles].index(vehicle)
         known = self.site.vehicles[who].z_m is not None
-        self._given[who] = True
+        self._given[who] = self._stated[who] = True
         inputs = self.belief.inputs
         turns = bool(turning(self.site)[who]) or (inputs is not None and bool(inputs.headed[who]))
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -142,6 +156,14 @@ class Follower:
             replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns, self.motion.tilt_pace_radps
         )
         self.belief = set_out(self.belief)
+
+    def unstarted(self, vehicles: NDArray[np.bool_]) -> Follower:
+        """Return this follower, at its beginning, without the start of these vehicles (V,) that was refuted."""
+        for who in np.flatnonzero(vehicles).tolist():
+            self.belief = unplaced(self.belief, who)
+            self._mirrored[who] = not self._given[who]
+            self._given[who] = self._stated[who] = False
+        return self
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -173,7 +195,7 @@ class Follower:
         before = self.belief
         self.belief, used, _ = update(before, epoch, links, candidates & ~taken)
         if before.inputs is not None and len(before.inputs.time_s) and before.heeded:
-            used = self._slipped(before, epoch, links, candidates & ~taken, used, events)
+            used = self._slipped(before, epoch, links, candidates & ~taken, used, events, ~self._tried(fixes))
         used |= taken
         if taken.any() or any(event.event in ("slip", "reset") for event in events):
             # a rival knows nothing of that
@@ -187,6 +209,7 @@ class Follower:
         self._doubt_wheels(before, epoch, links, candidates, events)
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
+        self._prove_start(fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
     def time_of(self, epoch: RangeEpoch) -> float:
@@ -212,15 +235,17 @@ class Follower:
         asked: NDArray[np.bool_],
         used: NDArray[np.bool_],
         events: list[Event],
+        asked_of: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Find the vehicle that moved without its own sensors noticing, where many ranges are refused.
+        """Find the vehicle that moved unnoticed by its own sensors, where many ranges are refused.
 
-        It is the one whose place, once opened, makes the epoch as a whole most likely; the epoch is then taken in anew.
+        It is the one of those ``asked_of`` (V,) whose place, once opened, makes the epoch as a whole most likely; the
+        epoch is then taken in anew. Ranges that others state may as well be outliers: a slip must be the likelier.
         Returns the rows used.
         """
         refused = asked & ~used
         best: tuple[float, int, Belief] | None = None
-        for who in np.flatnonzero(before.placed).tolist():
+        for who in np.flatnonzero(before.placed & asked_of).tolist():
             own = asked & self._touches(links, who)
             if np.count_nonzero(refused & own) < max(2, np.count_nonzero(own) / 2):
                 continue
@@ -231,10 +256,23 @@ class Follower:
         if best is None:
             return used
         _, who, opened = best
+        if before.trust is not None:
+            stays = weighed_rows(before, epoch, links, asked)
+            moved = weighed_rows(opened, epoch, links, asked)
+            if moved + SLIPS < stays:
+                return used
+        inputs, unproven = before.inputs, bool(self._stated[who])
+        if unproven and inputs is not None and inputs.wheel_slot[who] >= 0 and not turning(self.site)[who]:
+            # it may not head as was stated; the way driven will tell
+            mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
+            lift_heading(mean, covariance, free, who)
+            opened = replace(opened, mean=mean, covariance=covariance, free=free)
         opened, again, _ = update(opened, epoch, links, asked, together=False)
         if np.count_nonzero(again) <= np.count_nonzero(used):
             return used
         self.belief = opened
+        if unproven:
+            self._alone = None  # what it gathered was against that heading
         apart = np.hypot(*(self.belief.pose()[who, :2] - before.pose()[who, :2]))
         text = f"{np.count_nonzero(refused)} ranges disagreed: {apart:.2f} m from where its own sensors had it"
         events.append(Event(before.time_s, self.site.vehicles[who].id, "slip", text))
@@ -260,6 +298,24 @@ class Follower:
             self._given[who] = False
             self._rival = self._rival or beside(self.belief, who, fixes[who], self._arms[who])
             self._undecided[who] = self._rival is not None and self._rival.vehicle == who
+
+    def _tried(self, fixes: tuple[Fix, ...]) -> NDArray[np.bool_]:
+        """Whose start contests with another, or is about to (V,): misfit is for that to judge."""
+        fixed = {found.vehicle for found in fixes if found.status == "ok"}
+        contests = self._given & np.array([vehicle.id in fixed for vehicle in self.site.vehicles], bool)
+        return (contests & self._corrected) | self._undecided
+
+    def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event]) -> None:
+        """Note whose stated start ranges gainsay before they have borne it out."""
+        fixed = {found.vehicle for found in fixes if found.status == "ok"}
+        for who in np.flatnonzero(self._stated).tolist():
+            name = self.site.vehicles[who].id
+            told = {event.event for event in events if event.vehicle == name}
+            if told & {"reset", "slip"}:
+                self.refuted[who], self._stated[who], self._given[who] = True, False, False
+            elif name in fixed and not self._undecided[who]:
+                # a heading is borne out by sensors that it makes right (`_heed`)
+                self._given[who], self._stated[who] = False, self._judges_sensors
 
     def _clock(self, epoch: RangeEpoch, fixes: tuple[Fix, ...]) -> None:
         """Open the clock offset anew where nothing ties it to the last epoch's: a free-running source, or a start."""
@@ -316,9 +372,7 @@ class Follower:
     def _heed(self, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]) -> None:
         """Hear a vehicle's own sensors only as long as ranges that others state are not far likelier without them."""
         inputs, trust, now_s = self.belief.inputs, self.belief.trust, self.belief.time_s
-        if inputs is None or trust is None or not len(inputs.time_s) or len(self.belief.placed) != 1:
-            return
-        if self.free_running or not self.belief.placed[0] or not len(epoch):
+        if trust is None or not self._judges_sensors or not self.belief.placed[0] or not len(epoch):
             return
         if not self.belief.heeded:
             if self._silence.over(now_s):
@@ -328,17 +382,21 @@ class Follower:
         if self._alone is not None:
             self._alone = self._alone.take(now_s, self.motion, epoch, links, asked, trust.told)
         if self._alone is not None and self._alone.lost:
-            self._alone = unled(self.belief, bool(turning(self.site)[0]))
+            self._alone, self._stated[0] = unled(self.belief, bool(turning(self.site)[0])), False
         elif self._alone is None:
             self._alone = apart(self.belief, self._gathered(self.site.vehicles[0].id), self._arms[0])
         elif self._alone.won:
             self.belief = follows(self.belief, self._alone.belief)
             self._alone, self._rival, self._refused[0], self._undecided[0] = None, None, 0, False
-            silent_s = self._silence.begin(now_s)
             x, y, z = estimate(self.belief, self.site, 0, "fused").position_m
-            text = (
-                f"ranges gainsay its own sensors, unheard for {silent_s:g} s: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"
-            )
+            if self._stated[0] and inputs is not None and inputs.wheel_slot[0] >= 0:
+                # wheels are right only as the heading is that they began with: it is found anew
+                self.belief = replace(self.belief, heeded=True)
+                self._alone = unled(self.belief, bool(turning(self.site)[0]))
+                text = "ranges gainsay how it was stated to start"
+            else:
+                text = f"ranges gainsay its own sensors, unheard for {self._silence.begin(now_s):g} s"
+            text += f": placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"
             events.append(Event(now_s, self.site.vehicles[0].id, "reset", text))
 
     def _weigh(
@@ -382,9 +440,14 @@ class Follower:
             return used
         if rival is not None:
             rival, heard = rival.take(self.belief.time_s, self.motion, epoch, links, asked, trust.told)
-            self._rival = None if rival.lost or rival.won else rival
+            # a stated start that was not the likelier is not borne out, however alike both are by now
+            tried = bool(self._undecided[rival.vehicle] and self._stated[rival.vehicle])
+            likelier = rival.won or (tried and rival.lost and rival.ahead > 0.0)
+            self._rival = None if rival.lost or likelier else rival
             self._undecided[rival.vehicle] &= self._rival is not None
-            if rival.won:
+            if rival.lost and rival.course is not None:
+                self._stated[rival.vehicle] = False
+            if likelier:
                 self.belief = follows(self.belief, rival.belief)
                 self._refused[rival.vehicle] = 0
                 x, y, z = estimate(self.belief, self.site, rival.vehicle, "fused").position_m
@@ -397,7 +460,8 @@ class Follower:
                 if self._rival is None and np.any(self._touches(links, who)):
                     found = self._gathered(self.site.vehicles[who].id)
                     young = self.belief.time_s - self._begun_s[who] < TRIED_S
-                    for other in (found, image(self.belief, who, links, found))[: 1 + young]:
+                    mirrored = image(self.belief.mean[SIZE * who :][:3], self.belief.free, who, links, found)
+                    for other in (found, mirrored)[: 1 + young]:
                         self._rival = self._rival or beside(self.belief, who, other, self._arms[who])
                     if young and self._rival is not None and self._rival.vehicle == who:
                         self._undecided[who] = True
@@ -420,6 +484,13 @@ class Follower:
         return frozenset(np.flatnonzero(self._undecided).tolist())
 
     @property
+    def _judges_sensors(self) -> bool:
+        """Whether a track by ranges alone tells whether the sensors of the only vehicle are right."""
+        inputs = self.belief.inputs
+        sensed = inputs is not None and len(inputs.time_s) > 0 and len(self.belief.placed) == 1
+        return sensed and self._corrected and not self.free_running
+
+    @property
     def _corrected(self) -> bool:
         """Whether the track knows better than a fix how far stated ranges are off."""
         inputs = self.belief.inputs
@@ -433,6 +504,7 @@ class Follower:
 
     def _gather(self, epoch: RangeEpoch) -> None:
         if len(epoch):
+            self._since_s = min(self._since_s, epoch.sync_s)
             self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
 
     def _place(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> NDArray[np.bool_]:
@@ -447,6 +519,9 @@ class Follower:
             poor = found.status in ("too-few", "ambiguous") and not self.free_running
             if (poor or again) and np.any(self._touches(links, who)):
                 start = self._gathered(found.vehicle)
+            two = None if lost else self._twofold(who, start, links)
+            if two is not None:
+                start = two[int(self._mirrored[who])]
             if start.status not in ("ok", "inconsistent") or start.position_m is None:
                 continue
             aged = replace(self.belief, time_s=self.belief.time_s if self.belief.placed.any() else start.time_s)
@@ -461,10 +536,32 @@ class Follower:
                     taken |= start.used  # with errors open, the very same ranges would only blur their fix
             else:
                 taken |= start.used if start is found else self._touches(links, who)
+            if two is not None:
+                other = two[1 - int(self._mirrored[who])]
+                self._rival = begun(self.belief, who, other, self._arms[who], Course())
+                self._undecided[who], self._stated[who] = True, not self._mirrored[who]
             x, y, z = start.position_m
             word, why = ("reset", "ranges disagreed with the track") if lost else ("start", "first position")
             events.append(Event(start.time_s, found.vehicle, word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
         return taken
+
+    def _twofold(self, who: int, found: Fix, links: Links) -> tuple[Fix, Fix] | None:
+        """Return the two places where a vehicle with odometry may be by all ranges of some seconds, if that tells them.
+
+        Beacons on a line leave its mirror image open. A vehicle's turns are the other way round there.
+        """
+        inputs, place_m = self.belief.inputs, found.mirror_m
+        if inputs is None or not self._corrected or self._rival is not None or found.status != "ambiguous":
+            return None
+        if place_m is None or self.site.vehicles[who].z_m is None or inputs.wheel_slot[who] < 0:
+            return None
+        heard = {pair for epoch in self._recent for pair in zip(epoch.emitter, epoch.receiver, strict=True)}
+        early = self._recent[-1].sync_s < self._since_s + GATHER_S
+        if turning(self.site)[who] or (early and len(heard) < len(inputs.pairs)):
+            return None  # others may yet be heard
+        one = replace(found, status="ok", position_m=place_m, covariance=np.eye(2), states=("x", "y"))
+        other = image(place_m, self.belief.free, who, links, one)
+        return None if other.position_m is None else (one, other)
 
     def _contradicted(self, who: int, found: Fix) -> bool:
         """Whether a fix with ranges to check by says that a vehicle is not at all where its track has it."""

@@ -36,8 +36,11 @@ BEYOND = 0.001
 REOPENED_MPS = 1.0
 """Deviation of a pushed vehicle's velocity, as `belief.reopen` has it."""
 
-DRIVEN = tuple(POSE.index(name) for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate"))
-"""What a row of odometry tells of a vehicle."""
+DRIVEN = tuple(POSE.index(name) for name in ("x", "y", "yaw"))
+"""What a row of odometry tells of a vehicle by the arc that it ends."""
+
+GOING = tuple(POSE.index(name) for name in ("vx", "vy", "yaw_rate"))
+"""What it tells by what holds from there on: of the last row nothing does."""
 
 ITERATIONS = 30
 
@@ -128,7 +131,7 @@ class Problem:
             self.values.insert(k, belief.mean[index] / unit)
             self._zero.insert(k, np.zeros(len(node.index)))
         self._begun: dict[tuple[int, int], int] = {}
-        self._driven: dict[int, tuple[Floats, Floats]] = {}
+        self._driven: dict[int, tuple[Floats, Floats | None]] = {}
         self._unseen: dict[int, float] = {}
         self._fresh(0, self.nodes[0].index)
         self._told(0)
@@ -196,7 +199,11 @@ class Problem:
         cut = np.zeros(len(node.belief.mean), bool)
         cut[: len(pose)] = pose
         self._driven = self._believed(k, anew)
-        driven = [SIZE * who + i for who in self._driven for i in DRIVEN]
+        driven = [
+            SIZE * who + i
+            for who, (told, noise_of_arc) in self._driven.items()
+            for i in (*(() if noise_of_arc is None else DRIVEN), *(GOING if np.isfinite(told[4:]).all() else ()))
+        ]
         kept = np.array([s for s in node.index if s in set(before.index.tolist()) and not cut[s]], np.int64)
         kept = np.setdiff1d(kept, driven)
         self._fresh(k, np.setdiff1d(np.setdiff1d(node.index, kept), driven))
@@ -263,7 +270,7 @@ class Problem:
                 if begun is not None and np.isfinite(first) and np.isfinite(second):
                     self._chord(k, begun, who, first, second)
                 continue
-            if begun is not None and who in self._driven:
+            if who in self._driven:
                 self._drive(k, begun, who, *self._driven[who])
             if fourth > 0:
                 # what turns unseen does so after this knot: no arc begins here
@@ -299,23 +306,28 @@ class Problem:
         if noise is not None:
             self._difference(*difference, noise)
 
-    def _believed(self, k: int, anew: NDArray[np.bool_]) -> dict[int, tuple[Floats, Floats]]:
-        """Return what odometry tells by a node of vehicles that it carries there, and its noise.
+    def _believed(self, k: int, anew: NDArray[np.bool_]) -> dict[int, tuple[Floats, Floats | None]]:
+        """Return what odometry tells by a node of vehicles that it carries, with the noise of its arc, if any.
 
         As in the filter, nothing else ties such a vehicle to the node before.
         """
         node, inputs = self.nodes[k], self._passage.follower.belief.inputs
-        driven: dict[int, tuple[Floats, Floats]] = {}
+        driven: dict[int, tuple[Floats, Floats | None]] = {}
         for row in node.mark.rows if inputs is not None and node.belief.heeded else ():
             assert inputs is not None
             who, told = int(inputs.vehicle[row]), inputs.value[row]
             begun, at = self._begun.get((WHEELS, who)), SIZE * who
-            if inputs.kind[row] != WHEELS or begun is None or anew[who] or not np.isfinite(told).all():
+            if inputs.kind[row] != WHEELS or anew[who]:
                 continue
             if node.belief.deaf(who, float(inputs.time_s[row])):
                 continue
             pose = (at, at + 1, at + YAW)
-            if node.at(*pose) is None or not 0.0 < told[2] <= wheels.LONGEST_S:
+            if node.at(*pose) is None:
+                continue
+            if begun is None:
+                driven[who] = told, None
+                continue
+            if not np.isfinite(told[:4]).all() or not 0.0 < told[2] <= wheels.LONGEST_S:
                 continue
             slot = int(inputs.wheel_slot[who])
             noise = self._noise(k, begun, pose, (slot, slot + 1, slot + 2), self._arc(k, who, told))
@@ -330,7 +342,7 @@ class Problem:
         slot, arm, (way, turn, dt) = int(inputs.wheel_slot[who]), inputs.arm[who], told[:3].tolist()
         return lambda state: wheels.measure(state, who, slot, (way, turn, dt), arm, rough)
 
-    def _drive(self, k: int, begun: int, who: int, told: Floats, noise: Floats) -> None:
+    def _drive(self, k: int, begun: int | None, who: int, told: Floats, noise: Floats | None) -> None:
         """Let an arc lead to a node, and what is told next say how it goes on from there."""
         inputs, node, at = self._passage.follower.belief.inputs, self.nodes[k], SIZE * who
         assert inputs is not None
@@ -343,7 +355,11 @@ class Problem:
                 jacobians[0] = node.by(derivative)
             return -off
 
-        self._difference(k, begun, (at, at + 1, at + YAW), (slot, slot + 1, slot + 2), self._arc(k, who, told), noise)
+        pose, anchor = (at, at + 1, at + YAW), (slot, slot + 1, slot + 2)
+        if begun is not None and noise is not None:
+            self._difference(k, begun, pose, anchor, self._arc(k, who, told), noise)
+        if not np.isfinite(told[4:]).all():
+            return
         uneven = wheels.going(node.whole(self.values.atVector(k)), who, slot, (speed, rate), arm, rough)[2]
         self.graph.add(self._gtsam.CustomFactor(self._robust(uneven), [k], miss))
 
@@ -360,12 +376,18 @@ class Problem:
         So a push goes on after the epoch that told of it.
         """
         node, start = self.nodes[k], self.nodes[begun]
-        if start.at(*pose) is None:
+        own = start.at(*pose)
+        if own is None:
             return None
         state = node.whole(self.values.atVector(k))
         state[list(anchor)] = start.whole(self.values.atVector(begun))[list(pose)]
-        off, _, noise = measure(state)
-        return noise if off @ np.linalg.solve(noise, off) <= wheels.UNLIKELY else None
+        off, derivative, noise = measure(state)
+        # just before a row nothing but ranges and free motion may tell of a node
+        doubt = np.zeros(len(state))
+        doubt[node.index] = node.unit**2
+        doubt[list(anchor)] = start.unit[own] ** 2
+        expected = (derivative * doubt) @ derivative.T + noise
+        return noise if off @ np.linalg.solve(expected, off) <= wheels.UNLIKELY else None
 
     def _difference(
         self,

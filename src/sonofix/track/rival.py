@@ -18,7 +18,8 @@ from sonofix.geometry import Links
 from sonofix.locate.search import mirror
 from sonofix.records import Fix, Floats, RangeEpoch
 from sonofix.track import stated
-from sonofix.track.belief import SIZE, Belief, Motion, loosen, place, predict
+from sonofix.track.belief import SIZE, Belief, Motion, loosen, place, predict, set_out
+from sonofix.track.course import Course
 from sonofix.track.held import hold
 from sonofix.track.update import update
 
@@ -40,18 +41,25 @@ TRIED_S = 30.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rival:
-    """A track beside the track: what it believes, and by how much it was likelier since it began at ``since_s``."""
+    """A track beside the track: what it believes, and by how much it was likelier since it began at ``since_s``.
+
+    One with a ``course`` finds its heading by that, and has no end: its start is as good as the track's, and ranges
+    alone may never tell the two apart.
+    """
 
     belief: Belief
     vehicle: int
     since_s: float
     ahead: float = 0.0
+    course: Course | None = None
 
     def take(
         self, time_s: float, motion: Motion, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], others: float
     ) -> tuple[Rival, NDArray[np.bool_]]:
         """Follow an epoch of which the track made the log likelihood ``others``; return the rows used, too."""
         belief, used, news = heard(self.belief, time_s, motion, epoch, links, asked, others)
+        if self.course is not None and belief.heeded:
+            belief = set_out(self.course.head(belief))
         return replace(self, belief=belief, ahead=self.ahead + news), used
 
     @property
@@ -62,7 +70,8 @@ class Rival:
     @property
     def lost(self) -> bool:
         """Whether it is less likely beyond doubt, or has had its time."""
-        return self.ahead < -DECIDED or self.belief.time_s - self.since_s > TRIED_S
+        late = self.course is None and self.belief.time_s - self.since_s > TRIED_S
+        return self.ahead < -DECIDED or late
 
 
 def heard(
@@ -88,14 +97,16 @@ def heard(
     return belief, used, 0.0 if trust is None or trust.count[-1] < HEARD else trust.told - others
 
 
-def image(belief: Belief, vehicle: int, links: Links, like: Fix) -> Fix:
+def image(place_m: Floats, free: NDArray[np.bool_], vehicle: int, links: Links, like: Fix) -> Fix:
     """Return a fix at the mirror image of a vehicle's place in the line that the fixed ends of rows are nearest to.
+
+    ``place_m`` (3,) is that place, ``free`` what a belief follows.
 
     It has no position where they are not near a line, or where a heading or a height would have to be mirrored too.
     """
     at, listening = SIZE * vehicle, links.receiver_vehicle == vehicle
     nowhere = replace(like, position_m=None)
-    if belief.free[at + 2] or belief.free[at + 3]:
+    if free[at + 2] or free[at + 3]:
         return nowhere
     ends = np.concatenate(
         [
@@ -103,7 +114,7 @@ def image(belief: Belief, vehicle: int, links: Links, like: Fix) -> Fix:
             links.receiver_point[(links.emitter_vehicle == vehicle) & (links.receiver_vehicle < 0)],
         ]
     )
-    place_m = belief.mean[at : at + 3].copy()
+    place_m = place_m.copy()
     if len(ends) < 2 or not mirror(place_m, ends, 2):
         return nowhere
     return replace(like, position_m=place_m, covariance=np.eye(2), states=("x", "y"), velocity_mps=None)
@@ -121,12 +132,19 @@ def beside(belief: Belief, vehicle: int, found: Fix, arm: Floats) -> Rival | Non
     allowed = belief.covariance[own, own] + found.covariance[:2, :2] + stated.BIAS_SD_M**2 * np.eye(2)
     if apart @ np.linalg.solve(allowed, apart) < FAR:
         return None
-    begun = loosen(place(bare(belief), vehicle, found, arm), vehicle)
-    mean, covariance, free = begun.mean.copy(), begun.covariance.copy(), begun.free.copy()
+    return begun(belief, vehicle, found, arm)
+
+
+def begun(belief: Belief, vehicle: int, found: Fix, arm: Floats, course: Course | None = None) -> Rival:
+    """Begin a rival where a fix puts a vehicle; ranges must be stated by others."""
+    assert belief.inputs is not None
+    assert belief.trust is not None
+    loose = loosen(place(bare(belief), vehicle, found, arm), vehicle)
+    mean, covariance, free = loose.mean.copy(), loose.covariance.copy(), loose.free.copy()
     stated.begin(mean, covariance, free, belief.inputs.range_slot, belief.inputs.known_sd_m)
     hold(covariance, belief.held, free)
-    begun = replace(begun, mean=mean, covariance=covariance, free=free, trust=belief.trust.anew())
-    return Rival(begun, vehicle, belief.time_s)
+    loose = replace(loose, mean=mean, covariance=covariance, free=free, trust=belief.trust.anew())
+    return Rival(loose, vehicle, belief.time_s, course=course)
 
 
 def bare(belief: Belief) -> Belief:

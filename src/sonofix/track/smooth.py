@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonofix.geometry import link
 from sonofix.records import Estimate, Floats
@@ -124,7 +125,13 @@ def settle(
         for one in heard:
             passage.take(one)
             on_epoch()
-        if not left or not passage.marks:
+        if passage.follower.refuted.any():
+            # as if that start had not been stated
+            anew = settle(partial(_unstarted, begin, passage.follower.refuted), heard, rate_hz, passes, on_epoch, rows)
+            if anew.marks:
+                return anew
+        if not left or not passage.marks or passage.follower.hidden:
+            # of two starts that are not told apart none is linearised about
             return passage
         before = passage.follower
         following = guided(passage, () if guide is None else guide.openings)
@@ -156,6 +163,10 @@ def _beginnings(
 
 def _with(begin: Callable[[], Follower], scout: Follower, sizes: Floats) -> Follower:
     return begin().knowing(scout, sizes)
+
+
+def _unstarted(begin: Callable[[], Follower], refuted: NDArray[np.bool_]) -> Follower:
+    return begin().unstarted(refuted)
 
 
 def _mixed(parts: Sequence[tuple[float, list[tuple[Estimate, ...]]]]) -> list[tuple[Estimate, ...]]:

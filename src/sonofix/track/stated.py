@@ -61,6 +61,9 @@ UNDONE = 20.0
 STRAY = log(0.05 / 100.0)
 """Logarithm of the density (1/m) of a range that may be anything within 100 m; one in twenty is."""
 
+SETTLED = 0.3
+"""Logarithm of a change of a row's noise that is none."""
+
 REMEMBERED = 100.0
 """Ranges of a pair by which its noise is judged; of all pairs ten times as many."""
 
@@ -181,6 +184,26 @@ class Trust:
         tailed = float(np.clip(self.tailed + (told[0] - told[1]) @ tells, -UNDONE, UNDONE))
         each = tails @ told
         return replace(self, told=float(np.sum(np.maximum(each, STRAY))), tailed=tailed), larger
+
+    def together(self, miss: Floats, expected: Floats, noise: Floats, larger: Floats) -> Floats:
+        """Return by what the noise of rows (n,) grows where each is judged by what all others say, too.
+
+        What is off within what a wide prediction allows may be far off by the other rows. ``miss`` (n,) are innovations
+        and ``expected`` (n, n) their covariance, ``noise`` (n,) what is in that of each row, ``larger`` (n,) by what it
+        grows by the prediction alone. The row that is furthest from what is asked of it follows first.
+        """
+        larger, tails = larger.copy(), self.tails
+        for _ in range(2 * len(miss)):
+            rest = np.linalg.inv(expected + np.diag((larger - 1.0) * noise))
+            own = rest.diagonal()
+            spread = np.maximum(1.0 / own - (larger - 1.0) * noise, noise)
+            asked = 1.0 / (tails @ (1.0 / heavier((rest @ miss / own) ** 2 / spread, _FREEDOM)))
+            change = np.abs(np.log(asked / larger))
+            furthest = int(np.argmax(change))
+            if change[furthest] < SETTLED:
+                break
+            larger[furthest] = asked[furthest]
+        return larger
 
     def heard(
         self, pair: NDArray[np.int64], miss: Floats, spread: Floats, time_s: Floats

@@ -103,6 +103,10 @@ def update(
     if trust is not None:
         # the noise of others' ranges has heavy tails: what is far off counts less before it counts for nothing
         trust, larger = trust.weighed(pair, miss, spread, noise.diagonal())
+        if np.count_nonzero(near) > 2 and not with_rates:
+            some = np.ix_(near, near)
+            expected = crossed[near] @ derivative[near].T + noise[some]
+            larger[near] = trust.together(miss[near], expected, noise[some].diagonal(), larger[near])
         noise[np.diag_indices(len(rows))] *= larger
         belief = replace(belief, trust=trust)
     if not near.any():
@@ -303,19 +307,47 @@ def expect(
     return stated.show(mean, belief.inputs.range_slot, pair, len(belief.inputs.pairs), shown, derivative)
 
 
-def strangeness(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]) -> float:
-    """Minus twice the log likelihood (but for a constant) of all rows asked for, ranges and rates together."""
+def weighed_rows(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_]) -> float:
+    """Log likelihood of the rows asked for, of which any may be an outlier (`stated.STRAY`); of others' ranges.
+
+    Rows are taken for outliers one by one, the most unlikely first, as long as that makes the whole likelier.
+    """
+
+    def told(rows: NDArray[np.bool_]) -> float:
+        after, used, _ = update(belief, epoch, links, rows)
+        count = np.count_nonzero(used)
+        sound = strangeness(belief, epoch, links, used, after.mean) + count * np.log(2 * np.pi) if count else 0.0
+        return stated.STRAY * (np.count_nonzero(asked) - count) - 0.5 * float(sound)
+
+    rows, best = asked, told(asked)
+    while np.count_nonzero(rows) > 1:
+        fewer = [np.where(np.arange(len(rows)) == i, False, rows) for i in np.flatnonzero(rows)]
+        each = [told(some) for some in fewer]
+        if max(each) <= best:
+            break
+        best, rows = max(each), fewer[int(np.argmax(each))]
+    return best
+
+
+def strangeness(
+    belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], about: Floats | None = None
+) -> float:
+    """Minus twice the log likelihood (but for a constant) of all rows asked for, ranges and rates together.
+
+    Linearised at the mean, or at a state ``about``.
+    """
     placed = np.append(belief.placed, True)
     rows = np.flatnonzero(asked & placed[links.emitter_vehicle] & placed[links.receiver_vehicle])
     dt = epoch.time_s[rows] - belief.time_s
     others = belief.trust is not None and epoch.snr_db is None
     pair = pairs_of(belief, epoch, rows)
-    shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
+    mean = belief.mean if about is None else about
+    shown, derivative = expect(links.rows(rows), belief, mean, dt, epoch, pair)
     measured = epoch.range_m[rows]
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
     expected = derivative @ belief.covariance @ derivative.T + noise_of(belief, epoch, links, rows, dt, pair)
     if others and belief.trust is not None:
         expected[np.diag_indices(len(rows))] += belief.trust.extra(pair)
-    miss = measured - shown
+    miss = measured - shown - derivative @ (belief.mean - mean)
     return float(miss @ np.linalg.solve(expected, miss) + np.linalg.slogdet(expected)[1])
