@@ -96,11 +96,11 @@ def test_until_a_pushed_robot_is_found_its_place_is_open():
         assert off @ np.linalg.solve(moment.covariance[1, :2, :2], off) < 9.0
 
 
-def standing(starts, told):
-    """Return a recording of three robots that stand for 10 s, and hear each other to a millimetre twice a second."""
+def standing(starts, told, seconds=10.0, compass=False):
+    """Return a feed of three robots that stand, and hear each other to a millimetre twice a second."""
     names = ("R0", "R1", "R2")
     rng, rows = np.random.default_rng(1), []
-    for time_s in np.arange(0.1, 10.0, 0.5):
+    for time_s in np.arange(0.1, seconds, 0.5):
         for a, b in ((0, 1), (0, 2), (1, 2)):
             for source, listener in ((a, b), (b, a)):
                 far = np.hypot(*np.subtract(starts[a][:2], starts[b][:2])) + rng.normal(0, 1e-3)
@@ -109,7 +109,7 @@ def standing(starts, told):
     time_s, emitter, receiver, range_m = zip(*rows, strict=True)
     nodes = [{"id": name, "vehicle": name, "lever_arm_m": [0, 0, 0]} for name in names]
     vehicles = [{"id": name, "z_m": 0.0} for name in names]
-    odometry_s = np.repeat(np.arange(0.0, 10.0, 0.5), 3)
+    odometry_s = np.repeat(np.arange(0.0, seconds, 0.5), 3)
     still = np.zeros(len(odometry_s))
     tables = {
         "odometry": Table(
@@ -117,6 +117,9 @@ def standing(starts, told):
         ),
         "start": Table(dict(zip(("x_m", "y_m", "yaw_rad"), np.array(told, float).T, strict=True)), {"vehicle": names}),
     }
+    if compass:
+        headings = {"time_s": odometry_s, "heading_rad": np.tile([start[2] for start in starts], len(still) // 3)}
+        tables["compass"] = Table(headings, {"vehicle": names * (len(still) // 3)})
     site = Site.model_validate({"format": 1, "vehicle": vehicles, "beacon": nodes, "microphone": nodes})
     sd = np.full(len(rows), 1e-3)
     ranges = RangeRows(np.array(time_s), emitter, receiver, np.array(range_m), sd)
@@ -153,15 +156,37 @@ def test_smoothing_keeps_what_start_poses_tell():
             assert np.hypot(*(moment.pose[r, :2] - starts[r][:2])) < 0.02
 
 
+def without_odometry(feed, robot):
+    """Return the feed without the odometry of its last robot."""
+    assert robot == len(feed.robots) - 1
+    begin = feed.first[robot]
+    first = np.array([*feed.first[:-1], begin])
+    return replace(feed, first=first, odometry_s=feed.odometry_s[:begin], odometry=feed.odometry[:begin])
+
+
 def test_a_robot_without_odometry_has_not_left_before_it_could_be_heard():
     starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
-    feed = standing(starts, starts)
-    first = np.array([*feed.first[:3], feed.first[2]])
-    mute = replace(feed, first=first, odometry_s=feed.odometry_s[: first[2]], odometry=feed.odometry[: first[2]])
-    moments = [m for m, _ in follow(mute)]
+    moments = [m for m, _ in follow(without_odometry(standing(starts, starts), 2))]
     assert not [e for m in moments for e in m.events]
     off = moments[-1].pose[2, :2] - starts[2][:2]
     assert off @ np.linalg.solve(moments[-1].covariance[2, :2, :2], off) < 25.0
+
+
+# apart, its heading is soon no more known than told to be
+@pytest.mark.parametrize(("how", "last"), [(follow, ("left", 35.0)), (follow_apart, ("lost", 28.0))])
+def test_a_robot_without_odometry_stays_while_it_is_heard(how, last):
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = without_odometry(standing(starts, starts, seconds=45.0, compass=True), 2)
+    # heard a while after all began, and from 25 s on no more
+    heard = (feed.time_s > 2.5) & (feed.time_s < 25.0)
+    feed = feed.keep(heard | ((feed.listener != 2) & (feed.source != 2)))
+    moments = [m for m, _ in how(feed)]
+    events = [e for m in moments for e in m.events]
+    assert [(e.event, e.vehicle) for e in events] == [(last[0], "R2")]
+    assert events[0].time_s == pytest.approx(last[1], abs=1.5)
+    for moment in moments:
+        off = moment.pose[2, :2] - starts[2][:2]
+        assert moment.time_s > 25.0 or off @ np.linalg.solve(moment.covariance[2, :2, :2], off) < 25.0
 
 
 def test_a_robot_that_falls_silent_leaves_and_joins_again():

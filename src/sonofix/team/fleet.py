@@ -312,7 +312,9 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         now = time_s
         if time_s - left_s >= ASK_S:
             left_s = time_s
-            _leave(belief, feed, watch, recent, time_s, time_s - steps[0][0], events)
+            for robot in leave(feed, belief.placed, recent, time_s, time_s - steps[0][0], events):
+                belief.lift(robot)
+                watch.clear(robot)
         frozen = until_placed and belief.placed.all()
         count = last - first
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
@@ -356,16 +358,23 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         yield moment, belief
 
 
-def _leave(
-    belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, since_s: float, events: list[Event]
-) -> None:
-    """Take away robots of which nothing came for long; ``since_s``: how long ago all began."""
-    for robot in np.flatnonzero(belief.placed).tolist():
-        if min(time_s - recent.told_s(robot, time_s), since_s) > LEFT_S:
-            belief.lift(robot)
-            watch.clear(robot)
-            recent.forget(robot)
-            events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
+def leave(
+    feed: Feed, placed: NDArray[np.bool_], recent: Recent, time_s: float, since_s: float, events: list[Event]
+) -> list[int]:
+    """Return the placed robots of which nothing came for `LEFT_S`, and tell of them.
+
+    A robot that has no odometry is with the others as long as it is heard, or hears. ``since_s``: how long ago all
+    began, as nobody has left before anybody could be heard.
+    """
+    gone = [
+        robot
+        for robot in np.flatnonzero(placed).tolist()
+        if min(time_s - recent.told_s(robot, time_s), since_s) > LEFT_S
+    ]
+    for robot in gone:
+        recent.forget(robot)
+        events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
+    return gone
 
 
 def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: list[Event]) -> None:
