@@ -65,7 +65,7 @@ def test_smoothing_is_better_and_reaches_back():
 
 
 def test_a_push_is_found():
-    recording, truth = fleet(seconds=40, seed=4, pushed=(1, 25.0, 0.8))
+    recording, truth = fleet(seconds=40, seed=4, pushed=((1, 25.0, 0.8, 0.8),))
     moments, _ = run(recording)
     events = [e for m in moments for e in m.events if e.event == "slip"]
     assert events
@@ -78,7 +78,7 @@ def test_a_push_is_found():
 @pytest.mark.parametrize("robot", [0, 2])
 @pytest.mark.parametrize(("by_m", "takes_s"), [(0.8, 0.1), (1.5, 0.8), (-3.0, 0.6)])
 def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(robot, by_m, takes_s):
-    recording, truth = fleet(seconds=30, seed=8, pushed=(robot, 20.1, by_m), push_takes_s=takes_s)
+    recording, truth = fleet(seconds=30, seed=8, pushed=((robot, 20.1, by_m, by_m),), push_takes_s=takes_s)
     moments, _ = run(recording)
     events = [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15]
     assert events == [("slip", f"R{robot}")]
@@ -86,7 +86,7 @@ def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(r
 
 
 def test_until_a_pushed_robot_is_found_its_place_is_open():
-    recording, truth = fleet(seconds=30, seed=8, pushed=(1, 20.1, 1.0), push_takes_s=0.8)
+    recording, truth = fleet(seconds=30, seed=8, pushed=((1, 20.1, 1.0, 1.0),), push_takes_s=0.8)
     moments, _ = run(recording)
     slip_s = next(e.time_s for m in moments for e in m.events if e.event == "slip")
     between = [m for m in moments if 20.35 < m.time_s < slip_s]
@@ -271,7 +271,7 @@ def test_deviations_hold_where_errors_of_ranges_stay():
 
 
 def test_a_push_is_blamed_on_nobody_else():
-    recording, _ = fleet(seconds=40, seed=7, pushed=(1, 25.0, 0.8))
+    recording, _ = fleet(seconds=40, seed=7, pushed=((1, 25.0, 0.8, 0.8),))
     events = [e for m in run(recording)[0] for e in m.events if e.event in ("slip", "lost")]
     assert {e.vehicle for e in events} == {"R1"}
 

@@ -16,7 +16,7 @@ from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
-from sonofix.team.pushed import SLIPPED, Before, search
+from sonofix.team.pushed import SLIPPED, Before, Push, search
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
@@ -35,6 +35,9 @@ LEFT_S = 10.0
 
 JUDGED = 6
 """Latest measurements by which it is judged whether a robot is where its track has it."""
+
+DOUBTED = 9.0
+"""Squared miss, over its variance, beyond which a measurement does not agree, be it believed or not."""
 
 AT_ODDS = 8
 """Ranges of two robots, refused one after the other while the rest agrees, that show that one of them is elsewhere."""
@@ -65,6 +68,8 @@ class Moment:
     used : bool (rows, 2)
         Their ranges and bearings taken.
     events : tuple of Event
+    pushes : tuple of Push
+        That were found out now.
     """
 
     time_s: float
@@ -75,6 +80,7 @@ class Moment:
     rows: tuple[int, int]
     used: NDArray[np.bool_]
     events: tuple[Event, ...] = ()
+    pushes: tuple[Push, ...] = ()
 
 
 def instants(feed: Feed) -> list[tuple[float, int, int]]:
@@ -213,12 +219,20 @@ class Belief:
         at = self.at(robot)
         self.covariance[at, at] += np.diag(np.square(sd))
 
-    def moment(self, time_s: float, rows: tuple[int, int], used: NDArray[np.bool_], events: list[Event]) -> Moment:
+    def moment(
+        self,
+        time_s: float,
+        rows: tuple[int, int],
+        used: NDArray[np.bool_],
+        events: Sequence[Event],
+        pushes: Sequence[Push] = (),
+    ) -> Moment:
         """Return what is believed now."""
         robots = range(len(self.placed))
         pose = np.array([self.mean[self.at(r)] for r in robots])
         covariance = np.array([self.covariance[self.at(r), self.at(r)] for r in robots])
-        return Moment(time_s, pose, covariance, self.speed.copy(), self.placed.copy(), rows, used, tuple(events))
+        speed, placed = self.speed.copy(), self.placed.copy()
+        return Moment(time_s, pose, covariance, speed, placed, rows, used, tuple(events), tuple(pushes))
 
 
 class Watch:
@@ -246,11 +260,12 @@ class Watch:
             if feed.kind[i] != SIGHTING or not asked.any():
                 continue
             ends = int(feed.listener[i]), int(feed.source[i])
+            agrees = bool(np.all(used[k][asked]) and not np.any(told[k, :, 6] > DOUBTED))
             for robot, other in (ends, ends[::-1]):
                 if robot >= 0:
                     # fixed ends are told apart by their pair
                     partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
-                    self._latest[robot].append((i, partner, bool(np.all(used[k][asked]))))
+                    self._latest[robot].append((i, partner, agrees))
             if min(ends) >= 0 and asked[0]:
                 misses = self._odds.setdefault((min(ends), max(ends)), [])
                 misses.append(abs(float(told[k, 0, 0])))
@@ -307,6 +322,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     steps, told_of = instants(feed), set()
     for time_s, first, last in steps:
         events: list[Event] = []
+        pushes: list[Push] = []
         rows = (first, last)
         belief.drive(feed, time_s if now is None else now, time_s)
         now = time_s
@@ -332,7 +348,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             found = watch.astray()
             if found is not None and (feed.kind[first:last] == SIGHTING).any():
                 robot, refused = found
-                if _reopen(belief, feed, robot, refused[0], watch, recent, past, events):
+                if _reopen(belief, feed, robot, refused[0], watch, recent, past, events, pushes):
                     rough.forget(robot)
             belief.learn(feed, rows, used, told)
         if not frozen:
@@ -347,7 +363,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             event for pair, miss_m in odds.items() if pair not in told_of for event in _odd(feed, pair, miss_m, now)
         ]
         told_of = set(odds)
-        moment = belief.moment(time_s, rows, used, events)
+        moment = belief.moment(time_s, rows, used, events, pushes)
         for pair, miss_m in odds.items():
             # nothing tells which of them it is, nor by what it was turned round the others
             moment.covariance[list(pair), :2, :2] += (2.0 * miss_m) ** 2 * np.eye(2)
@@ -407,11 +423,12 @@ def _reopen(
     recent: Recent,
     past: Sequence[Before],
     events: list[Event],
+    pushes: list[Push],
 ) -> bool:
     """Find a robot that is not where its track has it, or take its place away; return whether that is decided."""
     now_s = past[-1].time_s
-    found = search(belief, feed, robot, first, list(past))
-    if found is None:
+    told = search(belief, feed, robot, first, list(past))
+    if told is None:
         if now_s - feed.time_s[first] < WAITED_S:
             return False
         belief.lift(robot)
@@ -419,6 +436,8 @@ def _reopen(
         text = "what is heard disagrees with its track: to be placed anew"
         events.append(Event(now_s, feed.robots[robot], "lost", text))
     else:
+        found, push = told
+        pushes.append(push)
         belief.mean[:], belief.covariance[:], belief.last[:] = found.mean, found.covariance, found.last
         apart = float(np.hypot(*found.shift[:2]))
         text = f"what is heard disagrees with its odometry: {apart:.2f} m from where that had it"

@@ -18,6 +18,7 @@ from sonofix.records import Floats
 from sonofix.team.feed import SIGHTING, Feed
 from sonofix.team.hear import REFUSED
 from sonofix.team.state import POSE
+from sonofix.track.wheels import ROBUST
 
 if TYPE_CHECKING:
     from sonofix.team.fleet import Belief
@@ -90,7 +91,16 @@ class Found:
     missed_m: float
 
 
-def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Before]) -> Found | None:
+@dataclass(frozen=True, slots=True)
+class Push:
+    """A robot was pushed some time after ``after_s``, when it was still where its track had it, and by ``until_s``."""
+
+    robot: int
+    after_s: float
+    until_s: float
+
+
+def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Before]) -> tuple[Found, Push] | None:
     """Find a robot that was pushed.
 
     Parameters
@@ -106,7 +116,7 @@ def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Be
 
     Returns
     -------
-    Found or None
+    Found and Push, or None
         None: too little was heard since to tell, nothing explains it, or more places than one do.
     """
     own = [k for k, before in enumerate(past) if any(_of(feed, robot, i) for i in range(*before.rows))]
@@ -122,6 +132,7 @@ def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Be
     turns = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     aside = near.missed_m * np.column_stack([np.cos(turns), np.sin(turns), np.zeros(DIRECTIONS)])
     found = [near, *(_settled(belief, feed, robot, since, over - begin, one) for one in aside)]
+    after_s = _still(belief, feed, robot, [past[k] for k in own if k < refused] or since[:1])
     belief.mean[:], belief.covariance[:], belief.last[:] = kept
     found = sorted((one for one in found if one.fits), key=lambda one: one.cost)
     at = belief.at(robot)
@@ -129,18 +140,41 @@ def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Be
         spread = np.trace(found[0].covariance[at, at][:2, :2])
         if one.cost - found[0].cost < RIVALS and np.sum((one.shift - found[0].shift)[:2] ** 2) > REFUSED * spread:
             return None
-    return found[0] if found else None
+    return (found[0], Push(robot, after_s, past[over].time_s)) if found else None
+
+
+def _still(belief: Belief, feed: Feed, robot: int, before: Sequence[Before]) -> float:
+    """Return when a robot was last where its track had it, as two partners agree: round one alone it may be pushed."""
+    agreed: set[tuple[int, int]] = set()
+    for step in reversed(before):
+        belief.mean[:], belief.covariance[:], belief.last[:] = step.mean, step.covariance, step.last
+        _, told = belief.hear(feed, step.rows)
+        for k, i in enumerate(range(*step.rows)):
+            if not _of(feed, robot, i) or np.isnan(told[k, :, 0]).all():
+                continue
+            if np.any(told[k, :, 0] ** 2 > ROBUST**2 * (told[k, :, 1] + told[k, :, 3])):
+                agreed.clear()
+                break
+            agreed.add(_partner(feed, robot, i))
+        if len(agreed) >= 2:
+            return step.time_s
+    return float(np.nextafter(before[0].time_s, -np.inf))
+
+
+def _partner(feed: Feed, robot: int, row: int) -> tuple[int, int]:
+    """Who is at a row's other end: a robot, or −1 and the number of the pair that a fixed end is told apart by."""
+    other = int(feed.source[row] if feed.listener[row] == robot else feed.listener[row])
+    return other, -1 if other >= 0 else int(feed.pair[row])
 
 
 def _told(feed: Feed, robot: int, steps: Sequence[Before]) -> bool:
     """Whether what was heard of a robot tells its pose, and whether it fits."""
     rows = [i for before in steps for i in range(*before.rows) if _of(feed, robot, i)]
-    partners = {(feed.source if feed.listener[i] == robot else feed.listener)[i] for i in rows}
-    fixed = {int(feed.pair[i]) for i in rows if min(feed.listener[i], feed.source[i]) < 0}
+    partners = {_partner(feed, robot, i) for i in rows}
     ranges, bearings = (int(np.isfinite(column[rows]).sum()) for column in (feed.range_m, feed.bearing_rad))
     if not rows or feed.time_s[rows[-1]] - feed.time_s[rows[0]] < SPAN_S:
         return False
-    return len(partners - {-1}) + len(fixed) >= 2 and ranges + bearings >= 2 + bool(bearings) + SPARE
+    return len(partners) >= 2 and ranges + bearings >= 2 + bool(bearings) + SPARE
 
 
 def _of(feed: Feed, robot: int, row: int) -> bool:
