@@ -29,10 +29,10 @@ def fleet(
     """Return a recording and, of each robot, true rows (time, x, y, yaw).
 
     ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: robots,
-    when, and how far in x and y (and how long that takes); ``staying_m``: by how much ranges of one pair err besides, always
-    the same; ``beside``: each landmark has another beside it, heard with the same such error; ``strays``: a factor
-    on the variance of how places stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as
-    `sonofix.team.kernel` and `.state` have it.
+    when, and how far in x and y (and how long that takes); ``staying_m``: by how much ranges of one pair err
+    besides, always the same; ``beside``: each landmark has another beside it, heard with the same such error;
+    ``strays``: a factor on the variance of how places stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry
+    as `sonofix.team.kernel` and `.state` have it.
     """
     rng = np.random.default_rng(seed)
     silent, dt = silent or {}, 0.1

@@ -85,6 +85,39 @@ def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(r
     assert nees(*errors(moments, truth, after_s=22.5)) < 4.0
 
 
+@pytest.mark.parametrize(
+    ("robot", "at_s", "by_m", "takes_s"),
+    [(0, 20.1, (-0.3, 1.2), 0.1), (1, 23.1, (0.0, -2.5), 0.8), (2, 26.1, (0.0, -2.5), 0.8)],
+)
+def test_smoothed_a_robot_is_free_while_it_is_pushed(robot, at_s, by_m, takes_s):
+    recording, truth = fleet(seconds=at_s + 8, seed=40 + robot, pushed=((robot, at_s, *by_m),), push_takes_s=takes_s)
+    feed = gather(recording)
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
+    pushes = [push for moment in moments for push in moment.pushes]
+    assert [push.robot for push in pushes] == [robot]
+    # truth's rows are 0.1 s apart, and what is heard 0.4 s
+    assert at_s - 0.8 <= pushes[0].after_s <= at_s
+    assert at_s + takes_s - 0.11 <= pushes[0].until_s <= at_s + takes_s + 0.8
+    after = smooth(feed, moments, belief, np.array(means))
+    around = [m for m in after if at_s - 1.0 < m.time_s < at_s + takes_s + 2.0]
+    error, covariance = errors(around, truth)
+    # 2 where deviations are right, of some 25 errors alike over seconds
+    assert nees(error, covariance) < 4.0
+    squares = np.einsum("ij,ij->i", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    assert squares.max() < 25.0
+
+
+def test_a_small_push_is_found_that_no_single_measurement_is_refused_for():
+    recording, truth = fleet(seconds=30, seed=40, pushed=((0, 20.1, -0.4, -0.3),))
+    moments, _ = run(recording)
+    assert [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15] == [("slip", "R0")]
+    assert nees(*errors(moments, truth, after_s=15)) < 4.0
+
+
 def test_until_a_pushed_robot_is_found_its_place_is_open():
     recording, truth = fleet(seconds=30, seed=8, pushed=((1, 20.1, 1.0, 1.0),), push_takes_s=0.8)
     moments, _ = run(recording)

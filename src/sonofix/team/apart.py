@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats
 from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import ASK_S, START_SD, Belief, Moment, Watch, instants, leave
+from sonofix.team.fleet import ASK_S, START_SD, Belief, Moment, instants, leave
 from sonofix.team.hear import TOLD as HEARD
 from sonofix.team.hear import age
 from sonofix.team.kernel import expect, turned_by
@@ -28,6 +28,7 @@ from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, X, Y
+from sonofix.team.watch import Watch
 
 EVERY_S = 1.0
 """Two robots that meet tell each other no more often."""

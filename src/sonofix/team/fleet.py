@@ -20,6 +20,7 @@ from sonofix.team.pushed import SLIPPED, Before, Push, search
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
+from sonofix.team.watch import Watch
 
 START_SD = (0.05, 0.05, 0.1)
 """Of a stated start pose, in m and rad."""
@@ -32,15 +33,6 @@ ASK_S = 1.0
 
 LEFT_S = 10.0
 """A robot of which nothing comes for so long has left."""
-
-JUDGED = 6
-"""Latest measurements by which it is judged whether a robot is where its track has it."""
-
-DOUBTED = 9.0
-"""Squared miss, over its variance, beyond which a measurement does not agree, be it believed or not."""
-
-AT_ODDS = 8
-"""Ranges of two robots, refused one after the other while the rest agrees, that show that one of them is elsewhere."""
 
 WAITED_S = 2.0
 """One that was pushed and is not found by then is lost."""
@@ -235,69 +227,6 @@ class Belief:
         return Moment(time_s, pose, covariance, speed, placed, rows, used, tuple(events), tuple(pushes))
 
 
-class Watch:
-    """Judges whether robots are where their tracks have them, by which of their latest measurements were refused."""
-
-    def __init__(self, robots: int) -> None:
-        self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
-        self._first: dict[int, int] = {}
-        self._odds: dict[tuple[int, int], list[float]] = {}
-
-    def clear(self, robot: int) -> None:
-        """Forget what was refused of a robot, by others too: they are not to blame."""
-        self._latest[robot].clear()
-        self._first.clear()
-        self._odds = {pair: misses for pair, misses in self._odds.items() if robot not in pair}
-        for latest in self._latest:
-            kept = [one for one in latest if one[1] != robot]
-            latest.clear()
-            latest.extend(kept)
-
-    def see(self, feed: Feed, rows: tuple[int, int], used: NDArray[np.bool_], told: Floats) -> None:
-        """Note what became of some measurements."""
-        for k, i in enumerate(range(*rows)):
-            asked = np.isfinite(told[k, :, 0])
-            if feed.kind[i] != SIGHTING or not asked.any():
-                continue
-            ends = int(feed.listener[i]), int(feed.source[i])
-            agrees = bool(np.all(used[k][asked]) and not np.any(told[k, :, 6] > DOUBTED))
-            for robot, other in (ends, ends[::-1]):
-                if robot >= 0:
-                    # fixed ends are told apart by their pair
-                    partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
-                    self._latest[robot].append((i, partner, agrees))
-            if min(ends) >= 0 and asked[0]:
-                misses = self._odds.setdefault((min(ends), max(ends)), [])
-                misses.append(abs(float(told[k, 0, 0])))
-                if used[k, 0]:
-                    misses.clear()
-
-    def astray(self) -> tuple[int, list[int]] | None:
-        """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
-
-        These are the first of each partner; None: there is no such robot, or too little to find it by.
-        """
-        worst: tuple[float, int, list[int]] | None = None
-        for robot, latest in enumerate(self._latest):
-            refused: dict[int, int] = {}
-            for row, partner, ok in latest:
-                if not ok:
-                    refused.setdefault(partner, row)
-            share = sum(not ok for _, _, ok in latest) / max(len(latest), 4)
-            if len(refused) < 2 or share < 0.6:
-                self._first.pop(robot, None)
-                continue
-            first = self._first.setdefault(robot, min(refused.values()))
-            if worst is None or share > worst[0]:
-                worst = share, robot, sorted({first, *refused.values()})
-        return None if worst is None else worst[1:]
-
-    def at_odds(self) -> dict[tuple[int, int], float]:
-        """Return pairs of robots whose ranges are refused again and again, and by how much (m) these are off."""
-        found = {pair: misses[-AT_ODDS:] for pair, misses in self._odds.items() if len(misses) >= AT_ODDS}
-        return {pair: float(np.median(misses)) for pair, misses in found.items()}
-
-
 def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Belief]]:
     """Run the joint filter over a feed, causally.
 
@@ -335,7 +264,8 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         count = last - first
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
         if count and not until_placed:
-            past.append(Before(time_s, rows, belief.mean.copy(), belief.covariance.copy(), belief.last.copy()))
+            before = belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), belief.rough.copy()
+            past.append(Before(time_s, rows, *before, rough.learnt()))
             while time_s - past[0].time_s > REWOUND_S:
                 past.popleft()
             ends = {int(end) for i in range(*rows) for end in (feed.listener[i], feed.source[i])} - {-1}
@@ -349,7 +279,9 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             if found is not None and (feed.kind[first:last] == SIGHTING).any():
                 robot, refused = found
                 if _reopen(belief, feed, robot, refused[0], watch, recent, past, events, pushes):
-                    rough.forget(robot)
+                    since_s = pushes[-1].after_s if pushes else float(feed.time_s[refused[0]])
+                    was = next((one for one in past if one.time_s >= since_s), past[-1])
+                    rough.unlearn(belief, robot, was.learnt, was.rough)
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
@@ -430,6 +362,10 @@ def _reopen(
     told = search(belief, feed, robot, first, list(past))
     if told is None:
         if now_s - feed.time_s[first] < WAITED_S:
+            return False
+        if not watch.refused(robot):
+            # measurements are worse than they were, and no other place explains them
+            watch.clear(robot)
             return False
         belief.lift(robot)
         recent.forget(robot)

@@ -22,6 +22,7 @@ from sonofix.track.wheels import ROBUST
 
 if TYPE_CHECKING:
     from sonofix.team.fleet import Belief
+    from sonofix.team.rough import Learnt
 
 SLIPPED = (3.0, 3.0, 0.5)
 """How far aside a robot may be found that was pushed, in m and rad."""
@@ -37,8 +38,8 @@ SPARE = 2
 SPAN_S = 0.3
 """What is heard within less may all be of a push that goes on."""
 
-LOOSE = 4.0
-"""What their squares, over their variances, may come to, each."""
+LOOSE = 3.0
+"""How many deviations more than is right their squares, over their variances, may come to in all."""
 
 BEFORE = 3
 """So many times before the first that was refused, what was heard of it may be of the push already."""
@@ -55,13 +56,15 @@ RIVALS = 9.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Before:
-    """A belief as it was before what was heard at an instant."""
+    """A belief as it was before what was heard at an instant, and what was learnt of odometry until then."""
 
     time_s: float
     rows: tuple[int, int]
     mean: Floats
     covariance: Floats
     last: Floats
+    rough: Floats
+    learnt: Learnt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,14 +129,16 @@ def search(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Be
     over = next((k for k in reversed(own) if k >= refused and _told(feed, robot, past[k:])), None)
     if over is None:
         return None
-    kept = belief.mean.copy(), belief.covariance.copy(), belief.last.copy()
+    kept = belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), belief.rough.copy()
     since = past[begin:]
+    # what the push has taught of its odometry is not so
+    belief.rough[robot] = since[0].rough[robot]
     near = _settled(belief, feed, robot, since, over - begin, np.zeros(POSE))
     turns = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     aside = near.missed_m * np.column_stack([np.cos(turns), np.sin(turns), np.zeros(DIRECTIONS)])
     found = [near, *(_settled(belief, feed, robot, since, over - begin, one) for one in aside)]
     after_s = _still(belief, feed, robot, [past[k] for k in own if k < refused] or since[:1])
-    belief.mean[:], belief.covariance[:], belief.last[:] = kept
+    belief.mean[:], belief.covariance[:], belief.last[:], belief.rough[:] = kept
     found = sorted((one for one in found if one.fits), key=lambda one: one.cost)
     at = belief.at(robot)
     for one in found[1:]:
@@ -223,6 +228,6 @@ def _again(belief: Belief, feed: Feed, robot: int, since: Sequence[Before], over
         count += int(asked.sum())
         missed_m = max([missed_m, *np.abs(told[asked[:, 0], 0, 0]).tolist()])
     found = belief.mean[at] - track[at]
-    fits &= cost <= LOOSE * count
+    fits &= cost <= count + LOOSE * np.sqrt(2.0 * count)
     cost += FARTHER * float(np.hypot(*found[:2]))
     return Found(belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), found, cost, fits, missed_m)
