@@ -111,6 +111,17 @@ def test_smoothed_a_robot_is_free_while_it_is_pushed(robot, at_s, by_m, takes_s)
     assert squares.max() < 25.0
 
 
+@pytest.mark.parametrize(("robots", "seed", "later_s"), [(3, 60, 0.0), (4, 61, 0.5), (3, 62, 1.0)])
+def test_two_that_are_pushed_at_once_are_both_found(robots, seed, later_s):
+    pushed = ((0, 20.1, 0.9, 0.5), (1, 20.1 + later_s, -0.7, 1.0))
+    recording, truth = fleet(robots=robots, seconds=27, seed=seed, pushed=pushed, push_takes_s=0.3)
+    moments, _ = run(recording)
+    events = [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15]
+    assert events == [("slip", "R0"), ("slip", "R1")]
+    # before, while these are sought, and after
+    assert nees(*errors(moments, truth, after_s=15)) < 4.0
+
+
 def test_a_small_push_is_found_that_no_single_measurement_is_refused_for():
     recording, truth = fleet(seconds=30, seed=40, pushed=((0, 20.1, -0.4, -0.3),))
     moments, _ = run(recording)

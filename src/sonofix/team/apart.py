@@ -259,9 +259,8 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
         for i in range(first, last):
             used[i - first], told[i - first] = (part[0] for part in team.hear(i))
         watch.see(feed, (first, last), used, told)
-        found = watch.astray()
-        if found is not None:
-            robot = found[0]
+        while astray := watch.astray():
+            robot = astray[0][0]
             watch.clear(robot)
             _lift(team, robot)
             recent.forget(robot)

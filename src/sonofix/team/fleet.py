@@ -265,7 +265,7 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
         if count and not until_placed:
             before = belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), belief.rough.copy()
-            past.append(Before(time_s, rows, *before, rough.learnt()))
+            past.append(Before(time_s, rows, *before, rough.learnt(), np.zeros(len(feed.robots), bool)))
             while time_s - past[0].time_s > REWOUND_S:
                 past.popleft()
             ends = {int(end) for i in range(*rows) for end in (feed.listener[i], feed.source[i])} - {-1}
@@ -275,13 +275,8 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             for robot in ends:
                 rough.slipped(belief, robot, time_s)
             watch.see(feed, rows, used, told)
-            found = watch.astray()
-            if found is not None and (feed.kind[first:last] == SIGHTING).any():
-                robot, refused = found
-                if _reopen(belief, feed, robot, refused[0], watch, recent, past, events, pushes):
-                    since_s = pushes[-1].after_s if pushes else float(feed.time_s[refused[0]])
-                    was = next((one for one in past if one.time_s >= since_s), past[-1])
-                    rough.unlearn(belief, robot, was.learnt, was.rough)
+            if (feed.kind[first:last] == SIGHTING).any():
+                _seek(belief, feed, watch, recent, rough, past, events, pushes)
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
@@ -299,10 +294,9 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         for pair, miss_m in odds.items():
             # nothing tells which of them it is, nor by what it was turned round the others
             moment.covariance[list(pair), :2, :2] += (2.0 * miss_m) ** 2 * np.eye(2)
-        found = watch.astray()
-        if found is not None:
+        for robot, _ in watch.astray():
             # moved aside, and nobody knows yet where to
-            moment.covariance[found[0]] += np.diag(np.square(SLIPPED))
+            moment.covariance[robot] += np.diag(np.square(SLIPPED))
         yield moment, belief
 
 
@@ -346,20 +340,45 @@ def _odd(feed: Feed, pair: tuple[int, int], miss_m: float, time_s: float) -> lis
     ]
 
 
+def _seek(
+    belief: Belief,
+    feed: Feed,
+    watch: Watch,
+    recent: Recent,
+    rough: Rough,
+    past: deque[Before],
+    events: list[Event],
+    pushes: list[Push],
+) -> None:
+    """Find robots that are not where their tracks have them, or take away their places."""
+    for _ in feed.robots:
+        astray = watch.astray()
+        for robot, first in astray:
+            others = [other for other, _ in astray if other != robot]
+            if _reopen(belief, feed, robot, first, others, watch, recent, rough, past, events, pushes):
+                break
+        else:
+            return
+
+
 def _reopen(
     belief: Belief,
     feed: Feed,
     robot: int,
     first: int,
+    others: Sequence[int],
     watch: Watch,
     recent: Recent,
-    past: Sequence[Before],
+    rough: Rough,
+    past: deque[Before],
     events: list[Event],
     pushes: list[Push],
 ) -> bool:
-    """Find a robot that is not where its track has it, or take its place away; return whether that is decided."""
-    now_s = past[-1].time_s
+    """Find a robot, first as if it alone were astray, or take its place away; return whether that is decided."""
+    now_s, name = past[-1].time_s, feed.robots[robot]
     told = search(belief, feed, robot, first, list(past))
+    if told is None and others:
+        told = search(belief, feed, robot, first, list(past), others)
     if told is None:
         if now_s - feed.time_s[first] < WAITED_S:
             return False
@@ -367,16 +386,22 @@ def _reopen(
             # measurements are worse than they were, and no other place explains them
             watch.clear(robot)
             return False
+        was = next((one for one in past if one.rows[1] > first), past[-1])
         belief.lift(robot)
         recent.forget(robot)
-        text = "what is heard disagrees with its track: to be placed anew"
-        events.append(Event(now_s, feed.robots[robot], "lost", text))
+        events.append(Event(now_s, name, "lost", "what is heard disagrees with its track: to be placed anew"))
     else:
         found, push = told
+        was = found.past[0]
         pushes.append(push)
         belief.mean[:], belief.covariance[:], belief.last[:] = found.mean, found.covariance, found.last
+        for _ in found.past:
+            past.pop()
+        past.extend(found.past)
         apart = float(np.hypot(*found.shift[:2]))
         text = f"what is heard disagrees with its odometry: {apart:.2f} m from where that had it"
-        events.append(Event(now_s, feed.robots[robot], "slip", text))
+        events.append(Event(now_s, name, "slip", text))
+    for one in (robot, *others):
+        rough.unlearn(belief, one, was.learnt, was.rough)
     watch.clear(robot)
     return True

@@ -61,12 +61,12 @@ class Watch:
                 if used[k, 0]:
                     misses.clear()
 
-    def astray(self) -> tuple[int, list[int]] | None:
-        """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
+    def astray(self) -> list[tuple[int, int]]:
+        """Return the robots that have surely been moved without odometry noticing, and the first row that shows it.
 
-        These are the first of each partner; None: there is no such robot, or too little to find it by.
+        That of which most disagrees comes first. None are told of which one partner alone tells so.
         """
-        worst: tuple[float, int, list[int]] | None = None
+        found: list[tuple[float, int, int]] = []
         for robot, latest in enumerate(self._latest):
             refused: dict[int, int] = {}
             for row, partner, ok, _ in latest:
@@ -75,11 +75,9 @@ class Watch:
             share = sum(not ok for _, _, ok, _ in latest) / max(len(latest), 4)
             if len(refused) < 2 or share < ASTRAY:
                 self._first.pop(robot, None)
-                continue
-            first = self._first.setdefault(robot, min(refused.values()))
-            if worst is None or share > worst[0]:
-                worst = share, robot, sorted({first, *refused.values()})
-        return None if worst is None else worst[1:]
+            else:
+                found.append((-share, robot, self._first.setdefault(robot, min(refused.values()))))
+        return [(robot, first) for _, robot, first in sorted(found)]
 
     def refused(self, robot: int) -> bool:
         """Whether most of what was heard of a robot latest was not even believed."""
