@@ -80,6 +80,7 @@ def fleet(
                     continue
                 delta = place - truth[to][k, :2]
                 bearing = np.arctan2(delta[1], delta[0]) - truth[to][k, 2]
+                bearing -= 2 * np.pi * np.round(bearing / (2 * np.pi))
                 noise = rng.normal(0, 0.05) + errs[to, view], rng.normal(0, 0.01)
                 if np.hypot(*delta) < 6.0:
                     rows.append((time[k], name, f"R{to}", np.hypot(*delta) + noise[0], bearing + noise[1]))
