@@ -79,9 +79,7 @@ def test_time_may_go_backwards_between_vehicles_only(tmp_path):
 
 
 def test_headings_wind_on_but_do_not_jump(tmp_path):
-    turning = "time_s,vehicle,heading_rad\n" + "".join(
-        f"{i},agv,{0.5 * i}\n{i},van,{-0.7 * i}\n" for i in range(300)
-    )
+    turning = "time_s,vehicle,heading_rad\n" + "".join(f"{i},agv,{0.5 * i}\n{i},van,{-0.7 * i}\n" for i in range(300))
     assert read(tmp_path, "compass", turning, TWO).columns["heading_rad"].max() == 149.5
     # the van's heading leads on to none of the other's
     told = problems(tmp_path, "compass", turning + "300,agv,-209.5\n", TWO)
