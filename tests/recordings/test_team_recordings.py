@@ -58,7 +58,6 @@ def test_a_pushed_robot_is_found_from_waveforms_and_nobody_else_blamed(captures)
             off = m.pose[r, :2] - [np.interp(m.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]
             assert np.hypot(*off) < 0.015
 
-
     # smoothed, it is as open while it is pushed as nobody knows then where it is
     assert belief is not None
     after = smooth(feed, moments, belief, np.array(means))

@@ -16,7 +16,7 @@ from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
-from sonofix.team.pushed import SLIPPED, Before, Push, search
+from sonofix.team.pushed import SLIPPED, Before, Push, search, still_s
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
@@ -61,7 +61,7 @@ class Moment:
         Their ranges and bearings taken.
     events : tuple of Event
     pushes : tuple of Push
-        That were found out now.
+        That were found out now, or that robots were lost by.
     """
 
     time_s: float
@@ -376,9 +376,12 @@ def _reopen(
 ) -> bool:
     """Find a robot, first as if it alone were astray, or take its place away; return whether that is decided."""
     now_s, name = past[-1].time_s, feed.robots[robot]
-    told = search(belief, feed, robot, first, list(past))
-    if told is None and others:
-        told = search(belief, feed, robot, first, list(past), others)
+    told = None
+    # it alone, it and one more, or all
+    for doubtful in dict.fromkeys([(), *((other,) for other in others), tuple(others)]):
+        told = search(belief, feed, robot, first, list(past), doubtful)
+        if told is not None:
+            break
     if told is None:
         if now_s - feed.time_s[first] < WAITED_S:
             return False
@@ -387,6 +390,7 @@ def _reopen(
             watch.clear(robot)
             return False
         was = next((one for one in past if one.rows[1] > first), past[-1])
+        pushes.append(Push(robot, still_s(belief, feed, robot, first, list(past)), now_s))
         belief.lift(robot)
         recent.forget(robot)
         events.append(Event(now_s, name, "lost", "what is heard disagrees with its track: to be placed anew"))

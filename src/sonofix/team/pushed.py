@@ -40,6 +40,9 @@ SPARE = 2
 SPAN_S = 0.3
 """What is heard within less may all be of a push that goes on."""
 
+UNEXPLAINED = 1 / 3
+"""The share of what was heard of others meanwhile that may be refused: else it was one of them that was pushed."""
+
 LOOSE = 3.0
 """How many deviations more than is right their squares, over their variances, may come to in all."""
 
@@ -88,7 +91,7 @@ class Found:
     cost : float
         Squares, over their variances, of what the latest measurements of the robot left, and its distance.
     fits : bool
-        Whether all these were taken, and fit together.
+        Whether all these were taken, and fit together, and so does what was heard of others.
     missed_m : float
         The most by which a range of these was off.
     """
@@ -144,7 +147,6 @@ def search(
     if over is None:
         return None
     kept = belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), belief.rough.copy()
-    after_s = _still(belief, feed, robot, [past[k] for k in own if k < refused] or past[:1])
     since = [replace(one, away=one.away | out) for one in past[begin:]]
     for k, one in enumerate(since):
         one.away[robot] = begin + k < over
@@ -161,12 +163,23 @@ def search(
         spread = np.trace(found[0].covariance[at, at][:2, :2])
         if one.cost - found[0].cost < RIVALS and np.sum((one.shift - found[0].shift)[:2] ** 2) > REFUSED * spread:
             return None
-    return (found[0], Push(robot, after_s, past[over].time_s)) if found else None
+    if not found:
+        return None
+    return found[0], Push(robot, still_s(belief, feed, robot, first, past), past[over].time_s)
 
 
-def _still(belief: Belief, feed: Feed, robot: int, before: Sequence[Before]) -> float:
-    """Return when a robot was last where its track had it, as two partners agree: round one alone it may be pushed."""
+def still_s(belief: Belief, feed: Feed, robot: int, first: int, past: Sequence[Before]) -> float:
+    """Return when a robot was last where its track had it, as two partners agree: round one alone it may be pushed.
+
+    Arguments as `search` has them.
+    """
+    nobody = np.zeros(len(feed.robots), bool)
+    before = [
+        one for one in past if one.rows[1] <= first and any(_of(feed, robot, i, nobody) for i in range(*one.rows))
+    ]
+    kept = belief.mean.copy(), belief.covariance.copy(), belief.last.copy()
     agreed: set[tuple[int, int]] = set()
+    found_s = float(np.nextafter((before or past)[0].time_s, -np.inf))
     for step in reversed(before):
         belief.mean[:], belief.covariance[:], belief.last[:] = step.mean, step.covariance, step.last
         _, told = _hear(belief, feed, step)
@@ -178,8 +191,10 @@ def _still(belief: Belief, feed: Feed, robot: int, before: Sequence[Before]) -> 
                 break
             agreed.add(_partner(feed, robot, i))
         if len(agreed) >= 2:
-            return step.time_s
-    return float(np.nextafter(before[0].time_s, -np.inf))
+            found_s = step.time_s
+            break
+    belief.mean[:], belief.covariance[:], belief.last[:] = kept
+    return found_s
 
 
 def _partner(feed: Feed, robot: int, row: int) -> tuple[int, int]:
@@ -228,6 +243,7 @@ def _settled(belief: Belief, feed: Feed, robot: int, since: Sequence[Before], ov
 def _again(belief: Belief, feed: Feed, robot: int, since: Sequence[Before], over: int, shift: Floats) -> Found:
     """Hear what came ``since``; the robot is away until instant ``over``."""
     at, cost, count, fits, missed_m = belief.at(robot), 0.0, 0, True, 0.0
+    heard = refused = 0
     belief.mean[:], belief.covariance[:], belief.last[:] = since[0].mean, since[0].covariance, since[0].last
     track, past = belief.mean.copy(), []
     for k, step in enumerate(since):
@@ -251,13 +267,16 @@ def _again(belief: Belief, feed: Feed, robot: int, since: Sequence[Before], over
         if k < over:
             continue
         mine = np.array([_of(feed, robot, i, step.away) for i in range(*step.rows)], bool)
-        asked = np.isfinite(told[:, :, 2]) & np.isfinite(told[:, :, 0]) & mine[:, None]
+        asked = np.isfinite(told[:, :, 2]) & np.isfinite(told[:, :, 0])
+        heard += int(np.sum(asked[~mine]))
+        refused += int(np.sum(asked[~mine] & ~used[~mine]))
+        asked &= mine[:, None]
         cost += float(np.sum(told[asked][:, 0] ** 2 / (told[asked][:, 1] + told[asked][:, 3])))
         fits &= bool(used[asked].all())
         count += int(asked.sum())
         missed_m = max([missed_m, *np.abs(told[asked[:, 0], 0, 0]).tolist()])
     found = belief.mean[at] - track[at]
-    fits &= cost <= count + LOOSE * np.sqrt(2.0 * count)
+    fits &= cost <= count + LOOSE * np.sqrt(2.0 * count) and refused <= UNEXPLAINED * heard
     cost += FARTHER * float(np.hypot(*found[:2]))
     now = belief.mean.copy(), belief.covariance.copy(), belief.last.copy()
     return Found(*now, past, found, cost, fits, missed_m)
