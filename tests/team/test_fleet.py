@@ -175,12 +175,18 @@ def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
     starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
     # as far from the first as it is, so that only its ranges with the second are wrong
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
-    moments = [m for m, _ in follow(standing(starts, [*starts[:2], (cos - 3 * sin, sin + 3 * cos, 0.0)]))]
+    feed = standing(starts, [*starts[:2], (cos - 3 * sin, sin + 3 * cos, 0.0)])
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
     events = [(e.event, e.vehicle) for m in moments for e in m.events]
     assert events == [("excluded", "R1"), ("excluded", "R2")]
     for r in range(3):
-        off = moments[-1].pose[r, :2] - starts[r][:2]
-        assert off @ np.linalg.solve(moments[-1].covariance[r, :2, :2], off) < 9.0
+        for moment in (moments[-1], *smooth(feed, moments, belief, np.array(means))):
+            off = moment.pose[r, :2] - starts[r][:2]
+            assert off @ np.linalg.solve(moment.covariance[r, :2, :2], off) < 9.0
     moments = [m for m, _ in follow(standing(starts, starts))]
     assert not [e for m in moments for e in m.events]
 

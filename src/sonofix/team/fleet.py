@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +20,7 @@ from sonofix.team.pushed import SLIPPED, Before, Push, search, still_s
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
-from sonofix.team.watch import Watch
+from sonofix.team.watch import Odds, Watch
 
 START_SD = (0.05, 0.05, 0.1)
 """Of a stated start pose, in m and rad."""
@@ -62,6 +62,8 @@ class Moment:
     events : tuple of Event
     pushes : tuple of Push
         That were found out now, or that robots were lost by.
+    odds : tuple of Odds
+        Robots that contradict each other now.
     """
 
     time_s: float
@@ -73,6 +75,7 @@ class Moment:
     used: NDArray[np.bool_]
     events: tuple[Event, ...] = ()
     pushes: tuple[Push, ...] = ()
+    odds: tuple[Odds, ...] = ()
 
 
 def instants(feed: Feed) -> list[tuple[float, int, int]]:
@@ -286,14 +289,11 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         if any(event.event in ("joined", "left", "lost") for event in events):
             past.clear()  # it was before that
         odds = watch.at_odds()
-        events += [
-            event for pair, miss_m in odds.items() if pair not in told_of for event in _odd(feed, pair, miss_m, now)
-        ]
-        told_of = set(odds)
-        moment = belief.moment(time_s, rows, used, events, pushes)
-        for pair, miss_m in odds.items():
-            # nothing tells which of them it is, nor by what it was turned round the others
-            moment.covariance[list(pair), :2, :2] += (2.0 * miss_m) ** 2 * np.eye(2)
+        events += [event for one in odds if one.robots not in told_of for event in _odd(feed, one, now)]
+        told_of = {one.robots for one in odds}
+        moment = replace(belief.moment(time_s, rows, used, events, pushes), odds=odds)
+        for one in odds:
+            moment.covariance[list(one.robots), :2, :2] += one.variance_m2 * np.eye(2)
         for robot, _ in watch.astray():
             # moved aside, and nobody knows yet where to
             moment.covariance[robot] += np.diag(np.square(SLIPPED))
@@ -331,11 +331,11 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
             events.append(Event(time_s, feed.robots[robot], "joined", text))
 
 
-def _odd(feed: Feed, pair: tuple[int, int], miss_m: float, time_s: float) -> list[Event]:
+def _odd(feed: Feed, odds: Odds, time_s: float) -> list[Event]:
     text = "its ranges with {} are off by {:.2f} m, while all else agrees: one of them is elsewhere"
-    names = [feed.robots[robot] for robot in pair]
+    names = [feed.robots[robot] for robot in odds.robots]
     return [
-        Event(time_s, name, "excluded", text.format(other, miss_m))
+        Event(time_s, name, "excluded", text.format(other, odds.miss_m))
         for name, other in zip(names, names[::-1], strict=True)
     ]
 

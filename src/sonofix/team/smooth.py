@@ -80,6 +80,7 @@ def smooth(
         smoothed, blocks, used = _pass(feed, moments, nominal, active, opened, errors, belief.rough, judged, on_moment)
         nominal = smoothed
         judged = _judge(feed, moments, nominal, active, errors)
+    blocks[:, :, [0, 1], [0, 1]] += _contradicted(moments, len(feed.robots))[:, :, None]
     out = []
     for k, moment in enumerate(moments):
         pose = nominal[k, : SIZE * len(feed.robots)].reshape(-1, SIZE)[:, :POSE]
@@ -120,6 +121,18 @@ def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Fl
             share = np.diff(np.append(push.after_s, times[within])) / (push.until_s - push.after_s)
             opened[within, push.robot] += share[:, None] * np.square(SLIPPED)
     return active, opened
+
+
+def _contradicted(moments: Sequence[Moment], robots: int) -> Floats:
+    """Return variances (k, V) by which places are open, as two contradict each other, since they last agreed."""
+    variance = np.zeros((len(moments), robots))
+    times = np.array([moment.time_s for moment in moments])
+    for k, moment in enumerate(moments):
+        for odds in moment.odds:
+            since = slice(int(np.searchsorted(times, odds.agreed_s, side="right")), k + 1)
+            for robot in odds.robots:
+                variance[since, robot] = np.maximum(variance[since, robot], odds.variance_m2)
+    return variance
 
 
 def _within(push: Push, times: Floats) -> slice:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,24 @@ AT_ODDS = 8
 """Ranges of two robots, refused one after the other while the rest agrees, that show that one of them is elsewhere."""
 
 
+@dataclass(frozen=True, slots=True)
+class Odds:
+    """Two robots whose ranges contradict where both are, since they last agreed (−∞: they never did), and by how much.
+
+    Nothing tells which of them is elsewhere, nor by what it was turned round the others: ``variance_m2`` allows for
+    twice as much, either way.
+    """
+
+    robots: tuple[int, int]
+    agreed_s: float
+    miss_m: float
+
+    @property
+    def variance_m2(self) -> float:
+        """Of both places, along each axis."""
+        return (2.0 * self.miss_m) ** 2
+
+
 class Watch:
     """Judges whether robots are where their tracks have them, by which of their latest measurements were refused."""
 
@@ -30,6 +49,7 @@ class Watch:
         self._latest: list[deque[tuple[int, int, bool, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
         self._first: dict[int, int] = {}
         self._odds: dict[tuple[int, int], list[float]] = {}
+        self._agreed_s: dict[tuple[int, int], float] = {}
 
     def clear(self, robot: int) -> None:
         """Forget what was refused of a robot, by others too: they are not to blame."""
@@ -60,6 +80,7 @@ class Watch:
                 misses.append(abs(float(told[k, 0, 0])))
                 if used[k, 0]:
                     misses.clear()
+                    self._agreed_s[min(ends), max(ends)] = float(feed.time_s[i])
 
     def astray(self) -> list[tuple[int, int]]:
         """Return the robots that have surely been moved without odometry noticing, and the first row that shows it.
@@ -84,7 +105,10 @@ class Watch:
         latest = self._latest[robot]
         return sum(not taken for *_, taken in latest) >= ASTRAY * max(len(latest), 4)
 
-    def at_odds(self) -> dict[tuple[int, int], float]:
-        """Return pairs of robots whose ranges are refused again and again, and by how much (m) these are off."""
-        found = {pair: misses[-AT_ODDS:] for pair, misses in self._odds.items() if len(misses) >= AT_ODDS}
-        return {pair: float(np.median(misses)) for pair, misses in found.items()}
+    def at_odds(self) -> tuple[Odds, ...]:
+        """Return pairs of robots whose ranges are refused again and again."""
+        return tuple(
+            Odds(pair, self._agreed_s.get(pair, -np.inf), float(np.median(misses[-AT_ODDS:])))
+            for pair, misses in self._odds.items()
+            if len(misses) >= AT_ODDS
+        )
