@@ -2,9 +2,8 @@
 
 A push takes a while, and what is heard meanwhile belongs to neither place. So what was heard of the robot since
 shortly before that began is left out, and its place is opened for the latest, as much as tells a place and whether it
-fits. Of others that may have been pushed too, nothing is heard unless that is needed. It is sought in all directions;
-where two places would do, such as mirror images in the line of two others, and neither is much nearer, it is not
-found.
+fits. Others that may have been pushed too can be left out as well. It is sought in all directions; where two places
+would do, such as mirror images in the line of two others, and neither is much nearer, it is not found.
 """
 
 from __future__ import annotations
