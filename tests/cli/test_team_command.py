@@ -5,12 +5,19 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from sonofix.channel import Line, simulate
 from sonofix.cli.main import app
+from sonofix.files import write_recording
+from sonofix.records import Table
+from sonofix.signals import codes
+from sonofix.signals.waveform import waveforms_of
+from sonofix.site import Site
 from team.made_fleet import fleet
 
 COLUMNS = ("time_s", "x_m", "y_m", "yaw_rad")
@@ -123,6 +130,72 @@ def test_exchanges_of_robots_on_clocks_of_their_own_place_them(folder, tmp_path)
     assert set(scored["track"]) == set(paths)
     # nothing but the start says where all of them together are
     assert max(track["rmse_xy_m"] for track in scored["track"].values()) < 0.3
+
+
+@pytest.fixture(scope="module")
+def sounding(tmp_path_factory):
+    """Write a waveform recording of two robots, one channel of which falls silent and one is clipped for a while."""
+    place, rate_hz, seconds = tmp_path_factory.mktemp("sounding") / "two", 48e3, 3.0
+    corners = [(0.0, 0.0, 2.5), (6.0, 0.2, 2.5), (3.0, 5.0, 2.5)]
+    names = [*(f"B{i}" for i in range(3)), "R0", "R1"]
+    stands = [*({"position_m": corner} for corner in corners), {"vehicle": "R0"}, {"vehicle": "R1"}]
+    taps = codes.primitive_taps(7)
+    site = Site.model_validate(
+        {
+            "air": {"sound_speed_mps": 343.2},
+            "schedule": {"period_s": 0.2, "synchronised": True},
+            "signal": {"carrier_hz": 15e3, "cycles_per_chip": 6, "bandwidth_hz": 4e3},
+            "vehicle": [{"id": "R0", "z_m": 0.4}, {"id": "R1", "z_m": 0.4}],
+            "beacon": [
+                {"id": name, **where, "code": {"family": "m-sequence", "degree": 7, "taps": list(taps[i])}}
+                for i, (name, where) in enumerate(zip(names, stands, strict=True))
+            ],
+            "microphone": [{"id": f"R{i}", "channel": i, "vehicle": f"R{i}"} for i in range(2)],
+        }
+    )
+    motions = {"R0": Line((1.5, 1.2, 0.4), (0.6, 0.4, 0.0)), "R1": Line((4.0, 3.0, 0.4), (-0.5, 0.0, 0.0))}
+    recording, truth = simulate(
+        site, motions, rate_hz=rate_hz, duration_s=seconds, waveforms=waveforms_of(site), level=0.3, noise_sd=2e-3
+    )
+    assert recording.blocks is not None
+    samples = np.concatenate(list(recording.blocks(65536)))
+    samples[int(1.0 * rate_hz) : int(1.8 * rate_hz), 0] = 0.0
+    loud = slice(int(2.0 * rate_hz), int(2.6 * rate_hz))
+    samples[loud, 1] = np.clip(30.0 * samples[loud, 1], -0.9, 0.9)
+    recording = replace(recording, blocks=lambda count: iter([samples]), sample_count=len(samples))
+    time_s = np.repeat(np.arange(0.0, seconds, 0.1), 2)
+    speed = np.tile([np.hypot(0.6, 0.4), 0.5], len(time_s) // 2)
+    odometry = Table(
+        {"time_s": time_s, "v_mps": speed, "yaw_rate_radps": 0 * speed}, {"vehicle": ("R0", "R1") * (len(time_s) // 2)}
+    )
+    yaw = np.array([np.arctan2(0.4, 0.6), np.pi])
+    start = Table({"x_m": np.array([1.5, 4.0]), "y_m": np.array([1.2, 3.0]), "yaw_rad": yaw}, {"vehicle": ("R0", "R1")})
+    write_recording(place, replace(recording, tables={"odometry": odometry, "start": start}), truth)
+    return place
+
+
+def test_what_is_wrong_with_samples_is_told_as_of_one_vehicle(sounding, tmp_path):
+    told, heard = {}, {}
+    for command in ("run", "team"):
+        out = tmp_path / command
+        done = run(command, sounding, "-o", out, "--no-plot")
+        assert done.exit_code == 0, done.stderr
+        with (out / "events.csv").open() as file:
+            events = [row for row in csv.DictReader(file) if not row["vehicle"]]
+        told[command] = [(row["time_s"], row["event"], row["detail"]) for row in events]
+        assert f"{len(events)} samples" in done.stdout
+        with (out / "ranges.csv").open() as file:
+            columns = ("time_s", "from", "to", "range_m", "sd_m", "range_rate_mps", "range_rate_sd_mps", "snr_db")
+            heard[command] = sorted(tuple(row[name] for name in columns) for row in csv.DictReader(file))
+    assert told["team"] == told["run"]
+    assert any("microphone R0: no sound at all" in detail for *_, detail in told["team"])
+    assert any("microphone R1" in detail and "clipped" in detail for *_, detail in told["team"])
+    assert heard["team"] == heard["run"]
+    assert all(all(row) for row in heard["team"])
+    scored = json.loads(run("score", sounding, tmp_path / "team", "--json").stdout)
+    for track in scored["track"].values():
+        assert track["rmse_xy_m"] < 0.02
+        assert track["nees_xy"] < 4.0
 
 
 @pytest.mark.parametrize(

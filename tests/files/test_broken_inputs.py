@@ -358,6 +358,17 @@ REFUSED: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ),
     ("steps negative", put("steps.csv", "time_s,length_m,heading_rad\n0,-1,0\n"), ("steps.csv", "from 0 to 100 m")),
     ("compass in degrees", put("compass.csv", "time_s,heading_rad\n0,271.5\n"), ("line 2, heading_rad", "not degrees")),
+    (
+        "compass in degrees, up to 90",
+        put("compass.csv", "time_s,heading_rad\n0,3\n0.5,6\n1,45\n1.5,90\n"),
+        ("line 4, heading_rad", "45", "line 5", "not degrees"),
+    ),
+    (
+        "bearings in degrees",
+        put("bearings.csv", "time_s,from,to,bearing_rad\n0,B1,M1,-40\n"),
+        ("bearings.csv", "line 2, bearing_rad", "-40", "not degrees"),
+    ),
+    ("start in degrees, up to 90", put("start.csv", "x_m,y_m,yaw_rad\n0,0,90\n"), ("yaw_rad", "90", "not degrees")),
     ("steps in degrees", put("steps.csv", "time_s,length_m,heading_rad\n0,0.6,180\n"), ("heading_rad", "not degrees")),
     ("start in degrees", put("start.csv", "x_m,y_m,yaw_rad\n0,0,180\n"), ("yaw_rad", "not degrees")),
     ("start beyond the earth", put("start.csv", "x_m,y_m,yaw_rad\n1e30,0,0\n"), ("start.csv", "line 2, x_m", "1e+08")),

@@ -78,6 +78,16 @@ def test_time_may_go_backwards_between_vehicles_only(tmp_path):
     assert "of agv" in line
 
 
+def test_headings_wind_on_but_do_not_jump(tmp_path):
+    turning = "time_s,vehicle,heading_rad\n" + "".join(f"{i},agv,{0.5 * i}\n{i},van,{-0.7 * i}\n" for i in range(300))
+    assert read(tmp_path, "compass", turning, TWO).columns["heading_rad"].max() == 149.5
+    # the van's heading leads on to none of the other's
+    told = problems(tmp_path, "compass", turning + "300,agv,-209.5\n", TWO)
+    assert len(told) == 1
+    assert "line 602, heading_rad" in told[0]
+    assert "not degrees" in told[0]
+
+
 def test_each_unknown_id_is_told_once(tmp_path):
     rows = "".join(f"{i},B{i % 2 + 2},M1,1\n" for i in range(50))
     (line,) = problems(tmp_path, "ranges", "time_s,from,to,range_m\n" + rows)

@@ -11,6 +11,7 @@ from sonofix.cli.main import app
 from sonofix.files import read_recording, read_truth
 from sonofix.team.feed import gather
 from sonofix.team.fleet import follow
+from sonofix.team.smooth import smooth
 from sonofix.team.tell import ranges_of
 
 
@@ -35,7 +36,10 @@ def test_a_pushed_robot_is_found_from_waveforms_and_nobody_else_blamed(captures)
     folder = captures / "team"
     heard = ranges_of(step.ranges for step in flow.run(read_recording(folder, to_run=True)))
     feed = gather(read_recording(folder, to_run=True), heard, own_ranges=True)
-    moments = [moment for moment, _ in follow(feed)]
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
     for name, truth in read_truth(folder).items():
         r = feed.robots.index(name)
         outside = [m for m in moments if not 9.0 <= m.time_s <= 10.0]
@@ -53,6 +57,16 @@ def test_a_pushed_robot_is_found_from_waveforms_and_nobody_else_blamed(captures)
         for m in (m for m in moments if abs(m.time_s - stop_s) < 0.1):
             off = m.pose[r, :2] - [np.interp(m.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]
             assert np.hypot(*off) < 0.015
+
+    # smoothed, it is as open while it is pushed as nobody knows then where it is
+    assert belief is not None
+    after = smooth(feed, moments, belief, np.array(means))
+    r, truth = feed.robots.index("R1"), read_truth(folder)["R1"]
+    for m in after:
+        off = m.pose[r, :2] - [np.interp(m.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]
+        assert off @ np.linalg.solve(m.covariance[r, :2, :2], off) < 9.0
+        # when between two epochs it began is not known
+        assert np.hypot(*off) < 0.02 or 8.8 < m.time_s < 9.4
 
 
 def test_samples_count_before_ranges_that_lie_beside_them(captures, tmp_path):

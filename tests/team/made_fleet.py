@@ -20,7 +20,7 @@ def fleet(
     turned_rad: float = 0.0,
     shift_m: tuple[float, float] = (0.0, 0.0),
     silent: dict[int, tuple[float, float]] | None = None,
-    pushed: tuple[int, float, float] | None = None,
+    pushed: tuple[tuple[int, float, float, float], ...] = (),
     push_takes_s: float = 0.1,
     staying_m: float = 0.0,
     beside: bool = False,
@@ -28,11 +28,11 @@ def fleet(
 ) -> tuple[Recording, dict[str, np.ndarray]]:
     """Return a recording and, of each robot, true rows (time, x, y, yaw).
 
-    ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: a robot,
-    when, and how far (and how long that takes); ``staying_m``: by how much ranges of one pair err besides, always
-    the same; ``beside``: each landmark has another beside it, heard with the same such error; ``strays``: a factor
-    on the variance of how places stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry as
-    `sonofix.team.kernel` and `.state` have it.
+    ``hears``: robots that hear landmarks; ``silent``: spans in which nothing comes of a robot; ``pushed``: robots,
+    when, and how far in x and y (and how long that takes); ``staying_m``: by how much ranges of one pair err
+    besides, always the same; ``beside``: each landmark has another beside it, heard with the same such error;
+    ``strays``: a factor on the variance of how places stray. Ranges err by 5 cm, bearings by 0.01 rad, and odometry
+    as `sonofix.team.kernel` and `.state` have it.
     """
     rng = np.random.default_rng(seed)
     silent, dt = silent or {}, 0.1
@@ -59,8 +59,9 @@ def fleet(
             yaw = pose[2] + rate * dt / 2
             pose = pose + [along * np.cos(yaw) - across * np.sin(yaw), along * np.sin(yaw) + across * np.cos(yaw), 0.0]
             pose[2] += rate * dt + rng.normal(0, np.sqrt((TWIST_RAD * rate + TWIST_M * speed) * dt))
-            if pushed is not None and pushed[0] == r and -dt / 2 < t - pushed[1] < push_takes_s - dt / 2:
-                pose[:2] += pushed[2] * dt / push_takes_s
+            for who, at_s, *by_m in pushed:
+                if who == r and -dt / 2 < t - at_s < push_takes_s - dt / 2:
+                    pose[:2] += np.array(by_m) * dt / push_takes_s
         truth.append(np.array(path))
         odometry.append(np.array(told))
     for path in truth:
@@ -79,6 +80,7 @@ def fleet(
                     continue
                 delta = place - truth[to][k, :2]
                 bearing = np.arctan2(delta[1], delta[0]) - truth[to][k, 2]
+                bearing -= 2 * np.pi * np.round(bearing / (2 * np.pi))
                 noise = rng.normal(0, 0.05) + errs[to, view], rng.normal(0, 0.01)
                 if np.hypot(*delta) < 6.0:
                     rows.append((time[k], name, f"R{to}", np.hypot(*delta) + noise[0], bearing + noise[1]))

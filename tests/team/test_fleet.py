@@ -65,7 +65,7 @@ def test_smoothing_is_better_and_reaches_back():
 
 
 def test_a_push_is_found():
-    recording, truth = fleet(seconds=40, seed=4, pushed=(1, 25.0, 0.8))
+    recording, truth = fleet(seconds=40, seed=4, pushed=((1, 25.0, 0.8, 0.8),))
     moments, _ = run(recording)
     events = [e for m in moments for e in m.events if e.event == "slip"]
     assert events
@@ -78,15 +78,59 @@ def test_a_push_is_found():
 @pytest.mark.parametrize("robot", [0, 2])
 @pytest.mark.parametrize(("by_m", "takes_s"), [(0.8, 0.1), (1.5, 0.8), (-3.0, 0.6)])
 def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(robot, by_m, takes_s):
-    recording, truth = fleet(seconds=30, seed=8, pushed=(robot, 20.1, by_m), push_takes_s=takes_s)
+    recording, truth = fleet(seconds=30, seed=8, pushed=((robot, 20.1, by_m, by_m),), push_takes_s=takes_s)
     moments, _ = run(recording)
     events = [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15]
     assert events == [("slip", f"R{robot}")]
     assert nees(*errors(moments, truth, after_s=22.5)) < 4.0
 
 
+@pytest.mark.parametrize(
+    ("robot", "at_s", "by_m", "takes_s"),
+    [(0, 20.1, (-0.3, 1.2), 0.1), (1, 23.1, (0.0, -2.5), 0.8), (2, 26.1, (0.0, -2.5), 0.8)],
+)
+def test_smoothed_a_robot_is_free_while_it_is_pushed(robot, at_s, by_m, takes_s):
+    recording, truth = fleet(seconds=at_s + 8, seed=40 + robot, pushed=((robot, at_s, *by_m),), push_takes_s=takes_s)
+    feed = gather(recording)
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
+    pushes = [push for moment in moments for push in moment.pushes]
+    assert [push.robot for push in pushes] == [robot]
+    # truth's rows are 0.1 s apart, and what is heard 0.4 s
+    assert at_s - 0.8 <= pushes[0].after_s <= at_s
+    assert at_s + takes_s - 0.11 <= pushes[0].until_s <= at_s + takes_s + 0.8
+    after = smooth(feed, moments, belief, np.array(means))
+    around = [m for m in after if at_s - 1.0 < m.time_s < at_s + takes_s + 2.0]
+    error, covariance = errors(around, truth)
+    # 2 where deviations are right, of some 25 errors alike over seconds
+    assert nees(error, covariance) < 4.0
+    squares = np.einsum("ij,ij->i", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    assert squares.max() < 25.0
+
+
+@pytest.mark.parametrize(("robots", "seed", "later_s"), [(3, 60, 0.0), (4, 61, 0.5), (3, 62, 1.0)])
+def test_two_that_are_pushed_at_once_are_both_found(robots, seed, later_s):
+    pushed = ((0, 20.1, 0.9, 0.5), (1, 20.1 + later_s, -0.7, 1.0))
+    recording, truth = fleet(robots=robots, seconds=27, seed=seed, pushed=pushed, push_takes_s=0.3)
+    moments, _ = run(recording)
+    events = [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15]
+    assert events == [("slip", "R0"), ("slip", "R1")]
+    # before, while these are sought, and after
+    assert nees(*errors(moments, truth, after_s=15)) < 4.0
+
+
+def test_a_small_push_is_found_that_no_single_measurement_is_refused_for():
+    recording, truth = fleet(seconds=30, seed=40, pushed=((0, 20.1, -0.4, -0.3),))
+    moments, _ = run(recording)
+    assert [(e.event, e.vehicle) for m in moments for e in m.events if e.time_s > 15] == [("slip", "R0")]
+    assert nees(*errors(moments, truth, after_s=15)) < 4.0
+
+
 def test_until_a_pushed_robot_is_found_its_place_is_open():
-    recording, truth = fleet(seconds=30, seed=8, pushed=(1, 20.1, 1.0), push_takes_s=0.8)
+    recording, truth = fleet(seconds=30, seed=8, pushed=((1, 20.1, 1.0, 1.0),), push_takes_s=0.8)
     moments, _ = run(recording)
     slip_s = next(e.time_s for m in moments for e in m.events if e.event == "slip")
     between = [m for m in moments if 20.35 < m.time_s < slip_s]
@@ -96,11 +140,11 @@ def test_until_a_pushed_robot_is_found_its_place_is_open():
         assert off @ np.linalg.solve(moment.covariance[1, :2, :2], off) < 9.0
 
 
-def standing(starts, told):
-    """Return a recording of three robots that stand for 10 s, and hear each other to a millimetre twice a second."""
+def standing(starts, told, seconds=10.0, compass=False):
+    """Return a feed of three robots that stand, and hear each other to a millimetre twice a second."""
     names = ("R0", "R1", "R2")
     rng, rows = np.random.default_rng(1), []
-    for time_s in np.arange(0.1, 10.0, 0.5):
+    for time_s in np.arange(0.1, seconds, 0.5):
         for a, b in ((0, 1), (0, 2), (1, 2)):
             for source, listener in ((a, b), (b, a)):
                 far = np.hypot(*np.subtract(starts[a][:2], starts[b][:2])) + rng.normal(0, 1e-3)
@@ -109,7 +153,7 @@ def standing(starts, told):
     time_s, emitter, receiver, range_m = zip(*rows, strict=True)
     nodes = [{"id": name, "vehicle": name, "lever_arm_m": [0, 0, 0]} for name in names]
     vehicles = [{"id": name, "z_m": 0.0} for name in names]
-    odometry_s = np.repeat(np.arange(0.0, 10.0, 0.5), 3)
+    odometry_s = np.repeat(np.arange(0.0, seconds, 0.5), 3)
     still = np.zeros(len(odometry_s))
     tables = {
         "odometry": Table(
@@ -117,6 +161,9 @@ def standing(starts, told):
         ),
         "start": Table(dict(zip(("x_m", "y_m", "yaw_rad"), np.array(told, float).T, strict=True)), {"vehicle": names}),
     }
+    if compass:
+        headings = {"time_s": odometry_s, "heading_rad": np.tile([start[2] for start in starts], len(still) // 3)}
+        tables["compass"] = Table(headings, {"vehicle": names * (len(still) // 3)})
     site = Site.model_validate({"format": 1, "vehicle": vehicles, "beacon": nodes, "microphone": nodes})
     sd = np.full(len(rows), 1e-3)
     ranges = RangeRows(np.array(time_s), emitter, receiver, np.array(range_m), sd)
@@ -128,12 +175,18 @@ def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
     starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
     # as far from the first as it is, so that only its ranges with the second are wrong
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
-    moments = [m for m, _ in follow(standing(starts, [*starts[:2], (cos - 3 * sin, sin + 3 * cos, 0.0)]))]
+    feed = standing(starts, [*starts[:2], (cos - 3 * sin, sin + 3 * cos, 0.0)])
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
     events = [(e.event, e.vehicle) for m in moments for e in m.events]
     assert events == [("excluded", "R1"), ("excluded", "R2")]
     for r in range(3):
-        off = moments[-1].pose[r, :2] - starts[r][:2]
-        assert off @ np.linalg.solve(moments[-1].covariance[r, :2, :2], off) < 9.0
+        for moment in (moments[-1], *smooth(feed, moments, belief, np.array(means))):
+            off = moment.pose[r, :2] - starts[r][:2]
+            assert off @ np.linalg.solve(moment.covariance[r, :2, :2], off) < 9.0
     moments = [m for m, _ in follow(standing(starts, starts))]
     assert not [e for m in moments for e in m.events]
 
@@ -153,15 +206,37 @@ def test_smoothing_keeps_what_start_poses_tell():
             assert np.hypot(*(moment.pose[r, :2] - starts[r][:2])) < 0.02
 
 
+def without_odometry(feed, robot):
+    """Return the feed without the odometry of its last robot."""
+    assert robot == len(feed.robots) - 1
+    begin = feed.first[robot]
+    first = np.array([*feed.first[:-1], begin])
+    return replace(feed, first=first, odometry_s=feed.odometry_s[:begin], odometry=feed.odometry[:begin])
+
+
 def test_a_robot_without_odometry_has_not_left_before_it_could_be_heard():
     starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
-    feed = standing(starts, starts)
-    first = np.array([*feed.first[:3], feed.first[2]])
-    mute = replace(feed, first=first, odometry_s=feed.odometry_s[: first[2]], odometry=feed.odometry[: first[2]])
-    moments = [m for m, _ in follow(mute)]
+    moments = [m for m, _ in follow(without_odometry(standing(starts, starts), 2))]
     assert not [e for m in moments for e in m.events]
     off = moments[-1].pose[2, :2] - starts[2][:2]
     assert off @ np.linalg.solve(moments[-1].covariance[2, :2, :2], off) < 25.0
+
+
+# apart, its heading is soon no more known than told to be
+@pytest.mark.parametrize(("how", "last"), [(follow, ("left", 35.0)), (follow_apart, ("lost", 28.0))])
+def test_a_robot_without_odometry_stays_while_it_is_heard(how, last):
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = without_odometry(standing(starts, starts, seconds=45.0, compass=True), 2)
+    # heard a while after all began, and from 25 s on no more
+    heard = (feed.time_s > 2.5) & (feed.time_s < 25.0)
+    feed = feed.keep(heard | ((feed.listener != 2) & (feed.source != 2)))
+    moments = [m for m, _ in how(feed)]
+    events = [e for m in moments for e in m.events]
+    assert [(e.event, e.vehicle) for e in events] == [(last[0], "R2")]
+    assert events[0].time_s == pytest.approx(last[1], abs=1.5)
+    for moment in moments:
+        off = moment.pose[2, :2] - starts[2][:2]
+        assert moment.time_s > 25.0 or off @ np.linalg.solve(moment.covariance[2, :2, :2], off) < 25.0
 
 
 def test_a_robot_that_falls_silent_leaves_and_joins_again():
@@ -246,7 +321,7 @@ def test_deviations_hold_where_errors_of_ranges_stay():
 
 
 def test_a_push_is_blamed_on_nobody_else():
-    recording, _ = fleet(seconds=40, seed=7, pushed=(1, 25.0, 0.8))
+    recording, _ = fleet(seconds=40, seed=7, pushed=((1, 25.0, 0.8, 0.8),))
     events = [e for m in run(recording)[0] for e in m.events if e.event in ("slip", "lost")]
     assert {e.vehicle for e in events} == {"R1"}
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sonofix.records import Floats, Recording, Step
     from sonofix.team.feed import Feed
     from sonofix.team.fleet import Moment
+    from sonofix.team.tell import Listened
 
 
 def team(
@@ -95,7 +96,7 @@ def _run(
     notes: list[str] = []
     try:
         with progress_bar() as bar:
-            feed = _feed(recording, bar)
+            feed, receiver = _feed(recording, bar)
             if landmarks_of:
                 feed = heard_by(feed, landmarks_of)
                 if not len(feed.time_s):
@@ -123,7 +124,7 @@ def _run(
             last: list = []
 
             def steps() -> Iterator[Step]:
-                for step in steps_of(feed, seen()):
+                for step in steps_of(feed, seen(), receiver=receiver):
                     kept.append(step)
                     yield step
 
@@ -139,14 +140,14 @@ def _run(
                     stop_if_asked()
 
                 moments = smoothed(feed, moments, last[0], np.array(means), on_moment=passed)
-                kept = list(steps_of(feed, moments, smoothed=True))
+                kept = list(steps_of(feed, moments, smoothed=True, receiver=receiver))
                 files.write_run(out, kept, recording.site)
     except KeyboardInterrupt:
         held = f"{out} holds the first {counted(len(kept), 'moment')}" if kept else "nothing was kept"
         raise Stopped(f"stopped; {held}" + (", not smoothed" if smooth and kept else "")) from None
     picture = out / "team.png"
     picture.unlink(missing_ok=True)
-    _summarise(folder, out, feed, moments, scored=bool(truths), smoothed=smooth)
+    _summarise(folder, out, feed, moments, kept, scored=bool(truths), smoothed=smooth)
     for note in notes:
         speaker().print(note)
     if plot:
@@ -183,21 +184,21 @@ def _check(recording: Recording, landmarks_of: list[str] | None) -> None:
             raise ValueError(f"--landmarks-of {name}: no vehicle of the site; it has {', '.join(ids)}")
 
 
-def _feed(recording: Recording, bar: Progress) -> Feed:
+def _feed(recording: Recording, bar: Progress) -> tuple[Feed, Listened | None]:
     """Gather what the receiver makes of a recording's samples, or what it states: ranges, or else exchanges."""
     from sonofix import flow
     from sonofix.team.feed import gather
-    from sonofix.team.tell import ranges_of
+    from sonofix.team.tell import listened, ranges_of
     from sonofix.two_way import exchange_epochs
 
     if recording.blocks is not None:
         task = bar.add_task("listening", total=recording.sample_count)
-        heard = flow.run(watched(recording, lambda count: bar.advance(task, count)))
-        return gather(recording, ranges_of(step.ranges for step in heard), own_ranges=True)
+        heard = list(flow.run(watched(recording, lambda count: bar.advance(task, count))))
+        return gather(recording, ranges_of(step.ranges for step in heard), own_ranges=True), listened(heard)
     if recording.ranges is not None or "exchanges" not in recording.tables:
-        return gather(recording)
+        return gather(recording), None
     epochs = list(exchange_epochs(recording.tables["exchanges"], recording.site))
-    return gather(recording, ranges_of(epochs), own_ranges=all(epoch.sd_stated for epoch in epochs))
+    return gather(recording, ranges_of(epochs), own_ranges=all(epoch.sd_stated for epoch in epochs)), None
 
 
 def _told(feed: Feed, belief, apart) -> list[str]:
@@ -209,7 +210,9 @@ def _told(feed: Feed, belief, apart) -> list[str]:
     return []
 
 
-def _summarise(folder: Path, out: Path, feed: Feed, moments: list[Moment], scored: bool, smoothed: bool) -> None:
+def _summarise(
+    folder: Path, out: Path, feed: Feed, moments: list[Moment], kept: list[Step], scored: bool, smoothed: bool
+) -> None:
     import numpy as np
 
     listener, source = feed.listener, feed.source
@@ -249,7 +252,7 @@ def _summarise(folder: Path, out: Path, feed: Feed, moments: list[Moment], score
                 "NEES of x, y (2 is right)",
             )
             print_table("Against the truth", tuple(found.track), {name: every[name] for name in keep})
-    events = [event for moment in moments for event in moment.events]
+    events = [event for step in kept for event in step.events]
     if events:
         from collections import Counter
 

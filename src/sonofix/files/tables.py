@@ -21,12 +21,15 @@ MOST_PROBLEMS = 5
 
 TEXT_COLUMNS = ("from", "to", "vehicle")
 
-LATEST_S, FARTHEST_M, FASTEST_MPS, FASTEST_RADPS, WIDEST_RAD = 1e10, 1e8, 1e3, 1e2, 1e2
+LATEST_S, FARTHEST_M, FASTEST_MPS, FASTEST_RADPS = 1e10, 1e8, 1e3, 1e2
 """No value of a table is larger: year 2286 since 1970, twice the way around the earth, what gyros measure at most (35
-rad/s), 16 turns. Beyond is another unit, as degrees are, or a slip."""
+rad/s). Beyond is another unit, or a slip."""
+
+TURN_RAD = 6.3
+"""A direction is told within one turn, either way and rounded; what is beyond is degrees. Headings that follow one
+another may go on beyond where a vehicle turns and turns, but not by more than that from one row to the next."""
 
 TIME = {"time_s": (-LATEST_S, LATEST_S, "s")}
-HEADING = {"heading_rad": (-WIDEST_RAD, WIDEST_RAD, "rad, not degrees")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,8 @@ class Layout:
     key : str or None
         A text column; None: all rows together.
     bounds : mapping from column to (lowest, highest, unit)
+    winds : str or None
+        A column of angles, rad, that may go on beyond a turn.
     """
 
     required: tuple[str, ...]
@@ -57,6 +62,7 @@ class Layout:
     key: str | None = None
     strictly: bool = False
     bounds: Mapping[str, tuple[float, float, str]] | None = None
+    winds: str | None = None
 
 
 LAYOUTS = {
@@ -74,7 +80,12 @@ LAYOUTS = {
             "time_of_flight_s": (-LATEST_S, LATEST_S, "s"),
         },
     ),
-    "bearings": Layout(("time_s", "from", "to", "bearing_rad"), given=("time_s", "bearing_rad"), key="to"),
+    "bearings": Layout(
+        ("time_s", "from", "to", "bearing_rad"),
+        given=("time_s", "bearing_rad"),
+        key="to",
+        bounds={"bearing_rad": (-TURN_RAD, TURN_RAD, "rad, not degrees")},
+    ),
     "exchanges": Layout(
         ("from", "to", "sent_s", "heard_s", "reply_sent_s", "reply_heard_s"),
         ("heard_sd_s", "reply_heard_sd_s"),
@@ -97,9 +108,10 @@ LAYOUTS = {
         ("time_s", "length_m", "heading_rad"),
         per_vehicle=True,
         key="vehicle",
-        bounds={**TIME, **HEADING, "length_m": (0.0, 100.0, "m")},
+        bounds={**TIME, "length_m": (0.0, 100.0, "m")},
+        winds="heading_rad",
     ),
-    "compass": Layout(("time_s", "heading_rad"), per_vehicle=True, key="vehicle", bounds={**TIME, **HEADING}),
+    "compass": Layout(("time_s", "heading_rad"), per_vehicle=True, key="vehicle", bounds=TIME, winds="heading_rad"),
     "imu": Layout(
         ("time_s", "gx_radps", "gy_radps", "gz_radps", "ax_mps2", "ay_mps2", "az_mps2"),
         per_vehicle=True,
@@ -115,7 +127,7 @@ LAYOUTS = {
         order=None,
         bounds={
             **{f"{axis}_m": (-FARTHEST_M, FARTHEST_M, "m") for axis in "xyz"},
-            "yaw_rad": (-WIDEST_RAD, WIDEST_RAD, "rad, not degrees"),
+            "yaw_rad": (-TURN_RAD, TURN_RAD, "rad, not degrees"),
         },
     ),
     "truth": Layout(
@@ -181,6 +193,8 @@ def read_table(path: Path, layout: Layout, site: Site | None) -> Table:
         for i in np.flatnonzero((values < low) | (values > high)):
             limit = f"at least {low:g}" if high == np.inf else f"from {low:g} to {high:g}"
             sheet.tell(f"line {lines[i]}, {column}", float(values[i]), f"must be {limit} {unit}")
+    if layout.winds in columns:
+        _winding(columns[layout.winds], names.get(layout.key or ""), lines, layout.winds, sheet)
     if site is not None:
         _known_ids(names, lines, site, sheet)
         if layout.per_vehicle and "vehicle" not in names and len(site.vehicles) == 1:
@@ -303,6 +317,18 @@ def _in_order(times: Floats, keys: Sequence[str] | None, lines: Sequence[int], l
             if steps[i] == 0:
                 remedy = "the row before has the same time; every epoch has one row"
             sheet.tell(f"line {lines[rows[i + 1]]}, {layout.order}", float(times[rows[i + 1]]), remedy)
+
+
+def _winding(values: Floats, keys: Sequence[str] | None, lines: Sequence[int], column: str, sheet: Sheet) -> None:
+    """Tell angles beyond a turn to which none before leads."""
+    before: dict[str, float] = {}
+    for i in np.flatnonzero(~np.isnan(values)).tolist():
+        key, value = keys[i] if keys else "", float(values[i])
+        if abs(value) > TURN_RAD and abs(value - before.get(key, np.inf)) > TURN_RAD:
+            remedy = f"must be from {-TURN_RAD:g} to {TURN_RAD:g} rad, not degrees, or go on from the row before"
+            sheet.tell(f"line {lines[i]}, {column}", value, remedy)
+            continue
+        before[key] = value
 
 
 def _sorted(columns: dict[str, Floats], names: dict[str, tuple[str, ...]], order: str | None) -> Table:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats
 from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import ASK_S, LEFT_S, START_SD, Belief, Moment, Watch, instants
+from sonofix.team.fleet import ASK_S, START_SD, Belief, Moment, instants, leave
 from sonofix.team.hear import TOLD as HEARD
 from sonofix.team.hear import age
 from sonofix.team.kernel import expect, turned_by
@@ -28,6 +28,7 @@ from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, X, Y
+from sonofix.team.watch import Watch
 
 EVERY_S = 1.0
 """Two robots that meet tell each other no more often."""
@@ -249,7 +250,8 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
         belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
     now: float | None = None
     asked_s = -np.inf
-    for time_s, first, last in instants(feed):
+    steps = instants(feed)
+    for time_s, first, last in steps:
         events: list[Event] = []
         team.drive(time_s if now is None else now, time_s)
         now = time_s
@@ -257,9 +259,8 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
         for i in range(first, last):
             used[i - first], told[i - first] = (part[0] for part in team.hear(i))
         watch.see(feed, (first, last), used, told)
-        found = watch.astray()
-        if found is not None:
-            robot = found[0]
+        while astray := watch.astray():
+            robot = astray[0][0]
             watch.clear(robot)
             _lift(team, robot)
             recent.forget(robot)
@@ -270,12 +271,14 @@ def follow_apart(feed: Feed) -> Iterator[tuple[Moment, Apart]]:
             team.tell(robot)
         if time_s - asked_s >= ASK_S:
             asked_s = time_s
+            gone = leave(feed, belief.placed, recent, time_s, time_s - steps[0][0], events)
+            for robot in gone:
+                _lift(team, robot)
+                watch.clear(robot)
             for robot in range(len(feed.robots)):
-                if belief.placed[robot] and time_s - recent.told_s(robot, time_s) > LEFT_S:
-                    _lift(team, robot)
-                    recent.forget(robot)
-                    events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
-                elif belief.placed[robot] and _unsure(belief, robot):
+                if robot in gone:
+                    continue
+                if belief.placed[robot] and _unsure(belief, robot):
                     _lift(team, robot)
                     events.append(Event(time_s, feed.robots[robot], "lost", "it hardly knows where it is"))
                 elif not sure[robot]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,10 +16,11 @@ from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
 from sonofix.team.noise import Noise, noise
 from sonofix.team.placing import Placed, place
-from sonofix.team.pushed import SLIPPED, Before, search
+from sonofix.team.pushed import SLIPPED, Before, Push, search, still_s
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
 from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
+from sonofix.team.watch import Odds, Watch
 
 START_SD = (0.05, 0.05, 0.1)
 """Of a stated start pose, in m and rad."""
@@ -32,12 +33,6 @@ ASK_S = 1.0
 
 LEFT_S = 10.0
 """A robot of which nothing comes for so long has left."""
-
-JUDGED = 6
-"""Latest measurements by which it is judged whether a robot is where its track has it."""
-
-AT_ODDS = 8
-"""Ranges of two robots, refused one after the other while the rest agrees, that show that one of them is elsewhere."""
 
 WAITED_S = 2.0
 """One that was pushed and is not found by then is lost."""
@@ -65,6 +60,10 @@ class Moment:
     used : bool (rows, 2)
         Their ranges and bearings taken.
     events : tuple of Event
+    pushes : tuple of Push
+        That were found out now, or that robots were lost by.
+    odds : tuple of Odds
+        Robots that contradict each other now.
     """
 
     time_s: float
@@ -75,6 +74,8 @@ class Moment:
     rows: tuple[int, int]
     used: NDArray[np.bool_]
     events: tuple[Event, ...] = ()
+    pushes: tuple[Push, ...] = ()
+    odds: tuple[Odds, ...] = ()
 
 
 def instants(feed: Feed) -> list[tuple[float, int, int]]:
@@ -213,74 +214,20 @@ class Belief:
         at = self.at(robot)
         self.covariance[at, at] += np.diag(np.square(sd))
 
-    def moment(self, time_s: float, rows: tuple[int, int], used: NDArray[np.bool_], events: list[Event]) -> Moment:
+    def moment(
+        self,
+        time_s: float,
+        rows: tuple[int, int],
+        used: NDArray[np.bool_],
+        events: Sequence[Event],
+        pushes: Sequence[Push] = (),
+    ) -> Moment:
         """Return what is believed now."""
         robots = range(len(self.placed))
         pose = np.array([self.mean[self.at(r)] for r in robots])
         covariance = np.array([self.covariance[self.at(r), self.at(r)] for r in robots])
-        return Moment(time_s, pose, covariance, self.speed.copy(), self.placed.copy(), rows, used, tuple(events))
-
-
-class Watch:
-    """Judges whether robots are where their tracks have them, by which of their latest measurements were refused."""
-
-    def __init__(self, robots: int) -> None:
-        self._latest: list[deque[tuple[int, int, bool]]] = [deque(maxlen=JUDGED) for _ in range(robots)]
-        self._first: dict[int, int] = {}
-        self._odds: dict[tuple[int, int], list[float]] = {}
-
-    def clear(self, robot: int) -> None:
-        """Forget what was refused of a robot, by others too: they are not to blame."""
-        self._latest[robot].clear()
-        self._first.clear()
-        self._odds = {pair: misses for pair, misses in self._odds.items() if robot not in pair}
-        for latest in self._latest:
-            kept = [one for one in latest if one[1] != robot]
-            latest.clear()
-            latest.extend(kept)
-
-    def see(self, feed: Feed, rows: tuple[int, int], used: NDArray[np.bool_], told: Floats) -> None:
-        """Note what became of some measurements."""
-        for k, i in enumerate(range(*rows)):
-            asked = np.isfinite(told[k, :, 0])
-            if feed.kind[i] != SIGHTING or not asked.any():
-                continue
-            ends = int(feed.listener[i]), int(feed.source[i])
-            for robot, other in (ends, ends[::-1]):
-                if robot >= 0:
-                    # fixed ends are told apart by their pair
-                    partner = other if other >= 0 else len(self._latest) + int(feed.pair[i])
-                    self._latest[robot].append((i, partner, bool(np.all(used[k][asked]))))
-            if min(ends) >= 0 and asked[0]:
-                misses = self._odds.setdefault((min(ends), max(ends)), [])
-                misses.append(abs(float(told[k, 0, 0])))
-                if used[k, 0]:
-                    misses.clear()
-
-    def astray(self) -> tuple[int, list[int]] | None:
-        """Return the robot that has surely been moved without its odometry noticing, and the rows to find it by.
-
-        These are the first of each partner; None: there is no such robot, or too little to find it by.
-        """
-        worst: tuple[float, int, list[int]] | None = None
-        for robot, latest in enumerate(self._latest):
-            refused: dict[int, int] = {}
-            for row, partner, ok in latest:
-                if not ok:
-                    refused.setdefault(partner, row)
-            share = sum(not ok for _, _, ok in latest) / max(len(latest), 4)
-            if len(refused) < 2 or share < 0.6:
-                self._first.pop(robot, None)
-                continue
-            first = self._first.setdefault(robot, min(refused.values()))
-            if worst is None or share > worst[0]:
-                worst = share, robot, sorted({first, *refused.values()})
-        return None if worst is None else worst[1:]
-
-    def at_odds(self) -> dict[tuple[int, int], float]:
-        """Return pairs of robots whose ranges are refused again and again, and by how much (m) these are off."""
-        found = {pair: misses[-AT_ODDS:] for pair, misses in self._odds.items() if len(misses) >= AT_ODDS}
-        return {pair: float(np.median(misses)) for pair, misses in found.items()}
+        speed, placed = self.speed.copy(), self.placed.copy()
+        return Moment(time_s, pose, covariance, speed, placed, rows, used, tuple(events), tuple(pushes))
 
 
 def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Belief]]:
@@ -307,17 +254,21 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
     steps, told_of = instants(feed), set()
     for time_s, first, last in steps:
         events: list[Event] = []
+        pushes: list[Push] = []
         rows = (first, last)
         belief.drive(feed, time_s if now is None else now, time_s)
         now = time_s
         if time_s - left_s >= ASK_S:
             left_s = time_s
-            _leave(belief, feed, watch, recent, time_s, time_s - steps[0][0], events)
+            for robot in leave(feed, belief.placed, recent, time_s, time_s - steps[0][0], events):
+                belief.lift(robot)
+                watch.clear(robot)
         frozen = until_placed and belief.placed.all()
         count = last - first
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
         if count and not until_placed:
-            past.append(Before(time_s, rows, belief.mean.copy(), belief.covariance.copy(), belief.last.copy()))
+            before = belief.mean.copy(), belief.covariance.copy(), belief.last.copy(), belief.rough.copy()
+            past.append(Before(time_s, rows, *before, rough.learnt(), np.zeros(len(feed.robots), bool)))
             while time_s - past[0].time_s > REWOUND_S:
                 past.popleft()
             ends = {int(end) for i in range(*rows) for end in (feed.listener[i], feed.source[i])} - {-1}
@@ -327,11 +278,8 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
             for robot in ends:
                 rough.slipped(belief, robot, time_s)
             watch.see(feed, rows, used, told)
-            found = watch.astray()
-            if found is not None and (feed.kind[first:last] == SIGHTING).any():
-                robot, refused = found
-                if _reopen(belief, feed, robot, refused[0], watch, recent, past, events):
-                    rough.forget(robot)
+            if (feed.kind[first:last] == SIGHTING).any():
+                _seek(belief, feed, watch, recent, rough, past, events, pushes)
             belief.learn(feed, rows, used, told)
         if not frozen:
             recent.add(belief.mean, belief.placed, rows)
@@ -341,31 +289,34 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         if any(event.event in ("joined", "left", "lost") for event in events):
             past.clear()  # it was before that
         odds = watch.at_odds()
-        events += [
-            event for pair, miss_m in odds.items() if pair not in told_of for event in _odd(feed, pair, miss_m, now)
-        ]
-        told_of = set(odds)
-        moment = belief.moment(time_s, rows, used, events)
-        for pair, miss_m in odds.items():
-            # nothing tells which of them it is, nor by what it was turned round the others
-            moment.covariance[list(pair), :2, :2] += (2.0 * miss_m) ** 2 * np.eye(2)
-        found = watch.astray()
-        if found is not None:
+        events += [event for one in odds if one.robots not in told_of for event in _odd(feed, one, now)]
+        told_of = {one.robots for one in odds}
+        moment = replace(belief.moment(time_s, rows, used, events, pushes), odds=odds)
+        for one in odds:
+            moment.covariance[list(one.robots), :2, :2] += one.variance_m2 * np.eye(2)
+        for robot, _ in watch.astray():
             # moved aside, and nobody knows yet where to
-            moment.covariance[found[0]] += np.diag(np.square(SLIPPED))
+            moment.covariance[robot] += np.diag(np.square(SLIPPED))
         yield moment, belief
 
 
-def _leave(
-    belief: Belief, feed: Feed, watch: Watch, recent: Recent, time_s: float, since_s: float, events: list[Event]
-) -> None:
-    """Take away robots of which nothing came for long; ``since_s``: how long ago all began."""
-    for robot in np.flatnonzero(belief.placed).tolist():
-        if min(time_s - recent.told_s(robot, time_s), since_s) > LEFT_S:
-            belief.lift(robot)
-            watch.clear(robot)
-            recent.forget(robot)
-            events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
+def leave(
+    feed: Feed, placed: NDArray[np.bool_], recent: Recent, time_s: float, since_s: float, events: list[Event]
+) -> list[int]:
+    """Return the placed robots of which nothing came for `LEFT_S`, and tell of them.
+
+    A robot that has no odometry is with the others as long as it is heard, or hears. ``since_s``: how long ago all
+    began, as nobody has left before anybody could be heard.
+    """
+    gone = [
+        robot
+        for robot in np.flatnonzero(placed).tolist()
+        if min(time_s - recent.told_s(robot, time_s), since_s) > LEFT_S
+    ]
+    for robot in gone:
+        recent.forget(robot)
+        events.append(Event(time_s, feed.robots[robot], "left", f"nothing came of it for {LEFT_S:g} s"))
+    return gone
 
 
 def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: list[Event]) -> None:
@@ -380,13 +331,34 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
             events.append(Event(time_s, feed.robots[robot], "joined", text))
 
 
-def _odd(feed: Feed, pair: tuple[int, int], miss_m: float, time_s: float) -> list[Event]:
+def _odd(feed: Feed, odds: Odds, time_s: float) -> list[Event]:
     text = "its ranges with {} are off by {:.2f} m, while all else agrees: one of them is elsewhere"
-    names = [feed.robots[robot] for robot in pair]
+    names = [feed.robots[robot] for robot in odds.robots]
     return [
-        Event(time_s, name, "excluded", text.format(other, miss_m))
+        Event(time_s, name, "excluded", text.format(other, odds.miss_m))
         for name, other in zip(names, names[::-1], strict=True)
     ]
+
+
+def _seek(
+    belief: Belief,
+    feed: Feed,
+    watch: Watch,
+    recent: Recent,
+    rough: Rough,
+    past: deque[Before],
+    events: list[Event],
+    pushes: list[Push],
+) -> None:
+    """Find robots that are not where their tracks have them, or take away their places."""
+    for _ in feed.robots:
+        astray = watch.astray()
+        for robot, first in astray:
+            others = [other for other, _ in astray if other != robot]
+            if _reopen(belief, feed, robot, first, others, watch, recent, rough, past, events, pushes):
+                break
+        else:
+            return
 
 
 def _reopen(
@@ -394,25 +366,46 @@ def _reopen(
     feed: Feed,
     robot: int,
     first: int,
+    others: Sequence[int],
     watch: Watch,
     recent: Recent,
-    past: Sequence[Before],
+    rough: Rough,
+    past: deque[Before],
     events: list[Event],
+    pushes: list[Push],
 ) -> bool:
-    """Find a robot that is not where its track has it, or take its place away; return whether that is decided."""
-    now_s = past[-1].time_s
-    found = search(belief, feed, robot, first, list(past))
-    if found is None:
+    """Find a robot, first as if it alone were astray, or take its place away; return whether that is decided."""
+    now_s, name = past[-1].time_s, feed.robots[robot]
+    told = None
+    # it alone, it and one more, or all
+    for doubtful in dict.fromkeys([(), *((other,) for other in others), tuple(others)]):
+        told = search(belief, feed, robot, first, list(past), doubtful)
+        if told is not None:
+            break
+    if told is None:
         if now_s - feed.time_s[first] < WAITED_S:
             return False
+        if not watch.refused(robot):
+            # measurements are worse than they were, and no other place explains them
+            watch.clear(robot)
+            return False
+        was = next((one for one in past if one.rows[1] > first), past[-1])
+        pushes.append(Push(robot, still_s(belief, feed, robot, first, list(past)), now_s))
         belief.lift(robot)
         recent.forget(robot)
-        text = "what is heard disagrees with its track: to be placed anew"
-        events.append(Event(now_s, feed.robots[robot], "lost", text))
+        events.append(Event(now_s, name, "lost", "what is heard disagrees with its track: to be placed anew"))
     else:
+        found, push = told
+        was = found.past[0]
+        pushes.append(push)
         belief.mean[:], belief.covariance[:], belief.last[:] = found.mean, found.covariance, found.last
+        for _ in found.past:
+            past.pop()
+        past.extend(found.past)
         apart = float(np.hypot(*found.shift[:2]))
         text = f"what is heard disagrees with its odometry: {apart:.2f} m from where that had it"
-        events.append(Event(now_s, feed.robots[robot], "slip", text))
+        events.append(Event(now_s, name, "slip", text))
+    for one in (robot, *others):
+        rough.unlearn(belief, one, was.learnt, was.rough)
     watch.clear(robot)
     return True

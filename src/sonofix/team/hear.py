@@ -22,7 +22,7 @@ TURNS = 4
 STRAIGHT = 0.05**2
 """In rad²: the variance of a direction below which one does."""
 
-TOLD = 6
+TOLD = 7
 """Numbers told of each measurement."""
 
 
@@ -77,7 +77,8 @@ def hear(
     told : float64 (rows, 2, TOLD), out
         Of each: what was measured less what was expected (NaN where nothing was), the variance that the belief gave
         that, the variance of its noise, and that taken for it; of ranges besides the expected square of the error that
-        stays (m²), and how much of that is new.
+        stays (m²), and how much of that is new; and what was measured less what was expected, squared, over the
+        variance of that, before any is taken for larger.
     work : float64 (3, n)
         Room.
 
@@ -143,6 +144,7 @@ def hear(
                 own = spread(covariance, row[j])
                 square = off * off / (own + taken)
                 told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3] = off, own, variance, taken
+                told[k, j, 6] = square
                 # a direction that cannot be is that of something else, whose range then tells nothing either
                 if square > REFUSED or wrong:
                     wrong = True

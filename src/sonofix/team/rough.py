@@ -8,12 +8,14 @@ which is a state: by its expected square, a step of expectation-maximisation an 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
+from sonofix.records import Floats
 from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.kernel import advance, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
@@ -119,6 +121,14 @@ def carry(mean, covariance, time_s, told, from_s, until_s, rough, psd):
         )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Learnt:
+    """Of V robots: logarithms of K members' likelihoods (V, K), and sums of two slips, count and square (V, 2, 2)."""
+
+    chances: Floats
+    slips: Floats
+
+
 class Rough:
     """What is learnt of the odometry of V robots; writes the factors of a `Belief`."""
 
@@ -136,8 +146,18 @@ class Rough:
         self._psd = wander_psd(feed.own_ranges)
 
     def forget(self, robot: int) -> None:
-        """Begin a robot's members anew: it was pushed, or placed elsewhere; what was learnt stays."""
+        """Begin a robot's members anew: it was placed elsewhere; what was learnt stays."""
         self._now_s[robot] = np.nan
+
+    def learnt(self) -> Learnt:
+        """Return what is known until now."""
+        return Learnt(self._chances.copy(), self._slips.copy())
+
+    def unlearn(self, belief: Belief, robot: int, learnt: Learnt, rough: Floats) -> None:
+        """Go back, for one robot, to what was ``learnt``, and the factors that led to: since then it was pushed."""
+        self.forget(robot)
+        self._chances[robot], self._slips[robot] = learnt.chances[robot], learnt.slips[robot]
+        belief.rough[robot] = rough[robot]
 
     def take(self, feed: Feed, belief: Belief, known: Noise, rows: tuple[int, int], robot: int, now_s: float) -> None:
         """Take rows in for one robot, of which ``belief`` knows all that came before; set its factors on noise."""

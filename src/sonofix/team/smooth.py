@@ -20,7 +20,7 @@ from sonofix.team.fleet import START_SD, Belief, Moment
 from sonofix.team.hear import REFUSED, age, spread
 from sonofix.team.kernel import STRAYS, advance, drive, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
-from sonofix.team.pushed import SLIPPED
+from sonofix.team.pushed import SLIPPED, Push
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior_sd, wander_psd
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
@@ -80,12 +80,11 @@ def smooth(
         smoothed, blocks, used = _pass(feed, moments, nominal, active, opened, errors, belief.rough, judged, on_moment)
         nominal = smoothed
         judged = _judge(feed, moments, nominal, active, errors)
-    speed = np.zeros(len(feed.robots))
+    blocks[:, :, [0, 1], [0, 1]] += _contradicted(moments, len(feed.robots))[:, :, None]
     out = []
     for k, moment in enumerate(moments):
         pose = nominal[k, : SIZE * len(feed.robots)].reshape(-1, SIZE)[:, :POSE]
         rows = slice(*moment.rows)
-        speed = moment.speed_mps
         out.append(
             replace(
                 moment,
@@ -93,7 +92,6 @@ def smooth(
                 covariance=blocks[k],
                 placed=active[k].copy(),
                 used=used[rows],
-                speed_mps=speed,
             )
         )
     return out
@@ -116,37 +114,72 @@ def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Fl
         opened[begin, r] = np.square(START_SD if r in feed.starts and begin == at[0] == 0 else OPEN_SD)
         again = at[1:][np.diff(at) > 1]
         opened[again, r] = np.square(OPEN_SD)
-    index = {name: r for r, name in enumerate(feed.robots)}
-    for k, moment in enumerate(moments):
-        for event in moment.events:
-            if event.event == "slip":
-                opened[k, index[event.vehicle]] += np.square(SLIPPED)
+    for moment in moments:
+        for push in moment.pushes:
+            within = _within(push, times)
+            # nobody knows when in that time, so as far and as likely in each part of it as the part is long
+            share = np.diff(np.append(push.after_s, times[within])) / (push.until_s - push.after_s)
+            opened[within, push.robot] += share[:, None] * np.square(SLIPPED)
     return active, opened
 
 
+def _contradicted(moments: Sequence[Moment], robots: int) -> Floats:
+    """Return variances (k, V) by which places are open, as two contradict each other, since they last agreed."""
+    variance = np.zeros((len(moments), robots))
+    times = np.array([moment.time_s for moment in moments])
+    for k, moment in enumerate(moments):
+        for odds in moment.odds:
+            since = slice(int(np.searchsorted(times, odds.agreed_s, side="right")), k + 1)
+            for robot in odds.robots:
+                variance[since, robot] = np.maximum(variance[since, robot], odds.variance_m2)
+    return variance
+
+
+def _within(push: Push, times: Floats) -> slice:
+    """Return the moments at which a robot may have come to be elsewhere."""
+    return slice(*np.searchsorted(times, (push.after_s, push.until_s), side="right").tolist())
+
+
 def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray[np.bool_]) -> Floats:
-    """Return means that reach back to each robot's first odometry: before it was placed, its odometry run backwards."""
+    """Return means that reach back to each robot's first odometry, and from where pushes were found out to these.
+
+    Before it was placed a robot's odometry is run backwards, and from where it was found to where it was pushed.
+    """
     nominal = means.copy()
-    pose, by, stray, smooth_way = np.empty(POSE), np.empty((POSE, SIZE)), np.empty(STRAYS), np.ones(4)
-    times = [moment.time_s for moment in moments]
+    times = np.array([moment.time_s for moment in moments])
     for r in range(len(feed.robots)):
-        own = slice(SIZE * r, SIZE * (r + 1))
-        a, b = feed.first[r], feed.first[r + 1]
         placed = [k for k, moment in enumerate(moments) if moment.placed[r]]
-        if not placed:
-            continue
-        for k in range(placed[0] - 1, -1, -1):
-            nominal[k, own] = nominal[k + 1, own]
-            if not active[k, r]:
-                continue
-            origin = np.concatenate([np.zeros(POSE), nominal[k + 1, own][POSE:]])
-            drive(origin, feed.odometry_s[a:b], feed.odometry[a:b], times[k], times[k + 1], smooth_way, pose, by, stray)
-            yaw = nominal[k + 1, own][YAW] - pose[2]
-            cos, sin = np.cos(yaw), np.sin(yaw)
-            back = np.array([cos * pose[0] - sin * pose[1], sin * pose[0] + cos * pose[1]])
-            nominal[k, own][:2] = nominal[k + 1, own][:2] - back
-            nominal[k, own][YAW] = yaw
+        if placed:
+            _backwards(feed, nominal, times, active, r, placed[0], 0)
+    for k, moment in enumerate(moments):
+        for push in moment.pushes:
+            within = _within(push, times)
+            _backwards(feed, nominal, times, active, push.robot, k, within.stop - 1)
+            own = slice(SIZE * push.robot, SIZE * push.robot + POSE)
+            begin, end = nominal[max(within.start - 1, 0), own], nominal[within.stop - 1, own]
+            gone = (times[within] - push.after_s) / (push.until_s - push.after_s)
+            nominal[within, own] = begin + gone[:, None] * (end - begin)
     return nominal
+
+
+def _backwards(
+    feed: Feed, nominal: Floats, times: Floats, active: NDArray[np.bool_], robot: int, last: int, first: int
+) -> None:
+    """Run a robot's odometry backwards from one moment to another, in place."""
+    own = slice(SIZE * robot, SIZE * (robot + 1))
+    told = slice(feed.first[robot], feed.first[robot + 1])
+    pose, by, stray, smooth_way = np.empty(POSE), np.empty((POSE, SIZE)), np.empty(STRAYS), np.ones(4)
+    for k in range(last - 1, first - 1, -1):
+        nominal[k, own] = nominal[k + 1, own]
+        if not active[k, robot]:
+            continue
+        origin = np.concatenate([np.zeros(POSE), nominal[k + 1, own][POSE:]])
+        drive(origin, feed.odometry_s[told], feed.odometry[told], times[k], times[k + 1], smooth_way, pose, by, stray)
+        yaw = nominal[k + 1, own][YAW] - pose[2]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        back = np.array([cos * pose[0] - sin * pose[1], sin * pose[0] + cos * pose[1]])
+        nominal[k, own][:2] = nominal[k + 1, own][:2] - back
+        nominal[k, own][YAW] = yaw
 
 
 STAYS, LEFT = 2, 3
@@ -382,7 +415,6 @@ def _judge(feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArr
     """Return weights (rows, 2) by what a track leaves of each measurement; 0: not believed (Huber 1964, cut off)."""
     weights = np.zeros((len(feed.time_s), 2))
     row = np.empty((2, nominal.shape[1]))
-    speed = np.zeros(len(feed.robots))
     for k, moment in enumerate(moments):
         for i in range(*moment.rows):
             a, b = int(feed.listener[i]), int(feed.source[i])
@@ -398,7 +430,7 @@ def _judge(feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArr
                     feed.listener_point[i],
                     feed.source_point[i],
                     1.0 / feed.sound_speed_mps,
-                    speed,
+                    moment.speed_mps,
                     row,
                 )
                 if errors[i, STAYS] > 0.0:

@@ -2,14 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from sonofix.ranging import RANGES_WITHOUT_SD_M
-from sonofix.records import Estimate, RangeEpoch, RangeRows, Source, Step
+from sonofix.records import Estimate, Event, Floats, RangeEpoch, RangeRows, Source, Step
 from sonofix.team.feed import Feed
-from sonofix.team.fleet import Moment
+from sonofix.team.fleet import Moment, instants
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Listened:
+    """What a receiver made of samples besides ranges.
+
+    Attributes
+    ----------
+    shown : mapping from (time_s, emitter, receiver) to (3,)
+        Of a range: range rate and its deviation (m/s), and the signal to noise ratio (dB); NaN where not told.
+    events : tuple of Event
+        Of samples (clipped, missing, a tone) and what could be made of them, in order of time.
+    """
+
+    shown: Mapping[tuple[float, str, str], Floats]
+    events: tuple[Event, ...]
+
+
+def listened(steps: Iterable[Step]) -> Listened:
+    """Return what a receiver's steps tell besides ranges; what they tell of vehicles is of another track."""
+    shown: dict[tuple[float, str, str], Floats] = {}
+    events: list[Event] = []
+    for step in steps:
+        epoch = step.ranges
+        untold = np.full(len(epoch), np.nan)
+        columns = (epoch.range_rate_mps, epoch.range_rate_sd_mps, epoch.snr_db)
+        told = np.column_stack([untold if column is None else column for column in columns])
+        ends = zip(epoch.time_s.tolist(), epoch.emitter, epoch.receiver, strict=True)
+        shown.update(zip(ends, told, strict=True))
+        events += [event for event in step.events if not event.vehicle]
+    return Listened(shown, tuple(sorted(events, key=lambda event: event.time_s)))
 
 
 def ranges_of(epochs: Iterable[RangeEpoch]) -> RangeRows:
@@ -23,12 +56,23 @@ def ranges_of(epochs: Iterable[RangeEpoch]) -> RangeRows:
     return RangeRows(np.array(time_s), tuple(emitter), tuple(receiver), np.array(range_m), np.array(sd_m))
 
 
-def steps_of(feed: Feed, moments: Iterable[Moment], smoothed: bool = False) -> Iterator[Step]:
-    """Return a `Step` for each moment: the ranges heard then, whether each was used, and an estimate a placed robot."""
+def steps_of(
+    feed: Feed, moments: Iterable[Moment], smoothed: bool = False, receiver: Listened | None = None
+) -> Iterator[Step]:
+    """Return a `Step` for each moment: the ranges heard then, whether each was used, and an estimate a placed robot.
+
+    ``receiver``: what it told besides; its events are those of the first moment that is no earlier, or of the last.
+    """
+    events = deque(receiver.events if receiver is not None else ())
+    end_s = instants(feed)[-1][0]
     for index, moment in enumerate(moments):
         first, last = moment.rows
         heard = [i for i in range(first, last) if np.isfinite(feed.range_m[i])]
         sd = feed.range_sd_m[heard]
+        rate, rate_sd, snr_db = _shown(feed, heard, receiver)
+        before: list[Event] = []
+        while events and (events[0].time_s <= moment.time_s or moment.time_s >= end_s):
+            before.append(events.popleft())
         epoch = RangeEpoch(
             index=index,
             sync_s=moment.time_s,
@@ -37,9 +81,9 @@ def steps_of(feed: Feed, moments: Iterable[Moment], smoothed: bool = False) -> I
             time_s=feed.time_s[heard],
             range_m=feed.range_m[heard],
             covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2),
-            range_rate_mps=None,
-            range_rate_sd_mps=None,
-            snr_db=None,
+            range_rate_mps=rate,
+            range_rate_sd_mps=rate_sd,
+            snr_db=snr_db,
             clock="known",
             sound_speed_mps=feed.sound_speed_mps,
             sd_stated=not np.isnan(sd).any(),
@@ -55,7 +99,19 @@ def steps_of(feed: Feed, moments: Iterable[Moment], smoothed: bool = False) -> I
             source: Source = "smoothed" if smoothed else "fused" if robot in entered else "predicted"
             estimates.append(_estimate(feed, moment, robot, source))
         used = moment.used[[i - first for i in heard], 0]
-        yield Step(epoch, (), tuple(estimates), moment.events, used, np.zeros(len(heard)))
+        yield Step(epoch, (), tuple(estimates), (*before, *moment.events), used, np.zeros(len(heard)))
+
+
+def _shown(
+    feed: Feed, rows: Sequence[int], receiver: Listened | None
+) -> tuple[Floats, Floats, Floats] | tuple[None, None, None]:
+    """Return rates, their deviations and signal to noise ratios of ranges; None where samples were not listened to."""
+    if receiver is None:
+        return None, None, None
+    untold = np.full(3, np.nan)
+    told = [receiver.shown.get((float(feed.time_s[i]), *feed.ends[i]), untold) for i in rows]
+    rate, rate_sd, snr_db = np.array(told).reshape(-1, 3).T
+    return rate, rate_sd, snr_db
 
 
 def _estimate(feed: Feed, moment: Moment, robot: int, source: Source) -> Estimate:
