@@ -15,14 +15,30 @@ from sonofix.track.belief import Belief, Motion, estimate, predict
 from sonofix.track.follow import Follower
 from sonofix.track.held import AIR
 from sonofix.track.inputs import gather
+from sonofix.track.late import Rewinder
 
 
 class Street:
-    """Follows vehicles by ranges, epoch after epoch."""
+    """Follows vehicles by ranges, epoch after epoch.
 
-    def __init__(self, site: Site, start: Table | None = None, rate_hz: float | None = None) -> None:
+    Parameters
+    ----------
+    site : Site
+    start : Table or None
+        Poses known beforehand.
+    rate_hz : float or None
+        Estimates at this rate; None: one an epoch.
+    late_s : float
+        Epochs may come out of order, late by so much; 0: each comes after those before it, as from one recorder.
+    """
+
+    def __init__(
+        self, site: Site, start: Table | None = None, rate_hz: float | None = None, late_s: float = 0.0
+    ) -> None:
         self.site = site
         self.rate_hz = rate_hz
+        self._late_s = late_s
+        self._rewinder: Rewinder | None = None
         self.follower = Follower(site, Motion(), site.free_running, gather(site, {}))
         self.air = SoundSpeed()
         self._start = start
@@ -42,6 +58,7 @@ class Street:
         self.air = SoundSpeed(thermometer(self.site, tables.get("temperature")), learns=AIR not in held)
         inputs = gather(self.site, tables, stated)
         self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs, held)
+        self._rewinder = None
 
     def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
         """Take in the ranges of one epoch."""
@@ -52,7 +69,12 @@ class Street:
 
         epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
         before, hidden = self.follower.belief, self.follower.hidden
-        estimates, used, events = self.follower.step(epoch, fixes)
+        if self._late_s > 0.0:
+            self._rewinder = self._rewinder or Rewinder(self.follower, self._late_s)
+            estimates, used, events = self._rewinder.step(epoch, fixes)
+            self.follower = self._rewinder.follower
+        else:
+            estimates, used, events = self.follower.step(epoch, fixes)
         believed = used.copy()
         offset = np.full(len(epoch), 0.0 if epoch.clock == "known" else np.nan)
         if epoch.clock == "common" and estimates and estimates[0].clock_offset_m is not None:
@@ -63,6 +85,8 @@ class Street:
                 believed[asked] = found.used[asked]
                 if found.clock_offset_m is not None:
                     offset[asked] = found.clock_offset_m
+        if any(event.event == "late" for event in events):
+            believed[:] = False
         if self.rate_hz is not None:
             estimates = self._between(before, hidden, estimates)
         return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)

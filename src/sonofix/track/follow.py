@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +123,10 @@ class Follower:
         self._panel = Panel() if alone and few else None
         self._alone: Alone | None = None
         self._silence = Silence()
+
+    def copied(self) -> Follower:
+        """Return a follower that is as this one is now, and goes its own way from here."""
+        return deepcopy(self, {id(part): part for part in (self.site, self.belief.inputs)})
 
     def knowing(self, other: Follower, sizes: Floats | None = None) -> Follower:
         """Return this follower, at its beginning, with what another has learnt of the same recording by its end.
