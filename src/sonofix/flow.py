@@ -11,10 +11,11 @@ from dataclasses import replace
 from itertools import chain
 
 from sonofix.acquire.explain import Hearing, insight
+from sonofix.locate.told import told_fixes
 from sonofix.peer_receiver import PeerReceiver
 from sonofix.ranging import stated_epochs
 from sonofix.receiver import Receiver
-from sonofix.records import Event, Insight, Recording, Step
+from sonofix.records import Event, Fix, Insight, RangeEpoch, Recording, Step
 from sonofix.signals.waveform import waveforms_of
 from sonofix.street import Street
 from sonofix.track.follow import Follower
@@ -40,24 +41,28 @@ def run(recording: Recording, rate_hz: float | None = None, held: Collection[str
     Raises
     ------
     ValueError
-        If the recording holds neither samples, ranges nor exchanges, or cannot be sampled at the site's carrier, or
-        ``held`` names what nothing calibrates.
+        If the recording holds neither samples, ranges, exchanges nor positions, or cannot be sampled at the site's
+        carrier, or ``held`` names what nothing calibrates.
     """
     if recording.blocks is not None and recording.rate_hz is not None:
         yield from _heard(recording, rate_hz, held)
         return
+    heard: Iterable[tuple[RangeEpoch, tuple[Fix, ...] | None]]
     if recording.ranges is not None:
-        epochs = iter(stated_epochs(recording.ranges, recording.site))
+        heard = ((epoch, None) for epoch in stated_epochs(recording.ranges, recording.site))
     elif "exchanges" in recording.tables:
-        epochs = exchange_epochs(recording.tables["exchanges"], recording.site)
+        heard = ((epoch, None) for epoch in exchange_epochs(recording.tables["exchanges"], recording.site))
+    elif "positions" in recording.tables:
+        heard = told_fixes(recording.tables["positions"], recording.site)
     else:
         raise ValueError(
-            "the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv nor exchanges.csv"
+            "the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv, exchanges.csv or "
+            "positions.csv"
         )
     street = Street(recording.site, recording.tables.get("start"), rate_hz)
     street.sense(recording.tables, _stated_pairs(recording), held)
-    for epoch in epochs:
-        yield street.walk(epoch)
+    for epoch, fixes in heard:
+        yield street.walk(epoch, fixes=fixes)
 
 
 def smoothed(
@@ -97,7 +102,7 @@ def smoothed(
     ModuleNotFoundError
         If ``graph`` is asked for and gtsam is not installed.
     ValueError
-        If ``lag_s`` is below 0, or a lag is asked of a graph.
+        If ``lag_s`` is below 0, or a lag is asked of a graph, or a graph of positions.
     """
     if lag_s is not None:
         if lag_s < 0:
@@ -106,6 +111,8 @@ def smoothed(
             raise ValueError("a graph smooths between a recording's ends; leave out either the graph or the lag")
         yield from _lagging(recording, steps, rate_hz, lag_s, held)
         return
+    if graph and recording.blocks is None and recording.ranges is None and "positions" in recording.tables:
+        raise ValueError("a graph is made of ranges; positions.csv is smoothed without it (--smooth)")
     kept = list(steps)
     if not kept:
         return
@@ -152,6 +159,8 @@ def _stated_pairs(recording: Recording) -> tuple[tuple[str, str], ...] | None:
         return None
     if recording.ranges is not None:
         return recording.ranges.pairs
+    if "exchanges" not in recording.tables:
+        return None
     table = recording.tables["exchanges"]
     if "heard_sd_s" in table.columns and "reply_heard_sd_s" in table.columns:
         return None  # times of a receiver that knows how well it hears, as ours does

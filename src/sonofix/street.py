@@ -60,14 +60,16 @@ class Street:
         self.follower = Follower(self.site, self.follower.motion, self.site.free_running, inputs, held)
         self._rewinder = None
 
-    def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = ()) -> Step:
-        """Take in the ranges of one epoch."""
+    def walk(self, epoch: RangeEpoch, flags: tuple[Event, ...] = (), fixes: tuple[Fix, ...] | None = None) -> Step:
+        """Take in the ranges of one epoch; or, where it has none, ``fixes`` of all vehicles that others made."""
         self.begin(epoch.sync_s)
 
         def solve(asked: RangeEpoch) -> tuple[Fix, ...]:
             return tuple(fix(asked, self.site, v.id) for v in self.site.vehicles)
 
-        epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
+        told: tuple[Event, ...] = ()
+        if fixes is None:
+            epoch, fixes, told = self.air.take(epoch, lambda e: fix_by_residuals(e, self.site, solve))
         before, hidden = self.follower.belief, self.follower.hidden
         if self._late_s > 0.0:
             self._rewinder = self._rewinder or Rewinder(self.follower, self._late_s)

@@ -180,7 +180,7 @@ def _measurement_lines(recording: Recording, figures: CaptureFigures | None) -> 
             f"{_plural(len(np.unique(rows.time_s)), 'instant')} in "
             f"{np.ptp(rows.time_s):.1f} s, {rows.range_m.min():.2f} to {rows.range_m.max():.2f} m"
         )
-    if figures is None and recording.ranges is None and "exchanges" not in recording.tables:
+    if figures is None and recording.ranges is None and not {"exchanges", "positions"} & set(recording.tables):
         yield "No samples and no ranges: nothing to compute positions from."
 
 

@@ -17,7 +17,7 @@ from sonofix.records import Floats, RangeRows, Recording, ReferenceBurst, Table,
 from sonofix.site import ChirpCode, ReferenceCode, Site
 from sonofix.two_way import replied
 
-SENSOR_FILES = ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings", "exchanges")
+SENSOR_FILES = ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings", "exchanges", "positions")
 LONGEST_REFERENCE_S = 10.0
 
 _T = TypeVar("_T")
@@ -73,9 +73,11 @@ def read_recording(folder: str | Path, *, to_run: bool = False) -> Recording:
         references = attempt(lambda: read_references(folder, site)) or {}
         if "exchanges" in tables:
             problems += _exchange_problems(tables["exchanges"], site)
-        if to_run and not problems and capture is None and ranges is None and "exchanges" not in tables:
-            remedy = "nothing to compute positions from; add capture.wav, capture.flac, ranges.csv or exchanges.csv"
-            problems.append(Problem(str(folder), "", None, remedy))
+        problems += _position_problems(tables.get("positions"), site)
+        stated = ranges is not None or "exchanges" in tables or "positions" in tables
+        if to_run and not problems and capture is None and not stated:
+            remedy = "nothing to compute positions from; add capture.wav, capture.flac, ranges.csv, exchanges.csv"
+            problems.append(Problem(str(folder), "", None, f"{remedy} or positions.csv"))
     if problems or site is None:
         raise RecordingError(problems)
     sync = tables.pop("sync", None)
@@ -196,6 +198,20 @@ def _exchange_problems(table: Table, site: Site) -> list[Problem]:
         except ValueError as error:
             problems.append(Problem("exchanges.csv", "from, to", ", ".join(ends), str(error)))
     return problems
+
+
+def _position_problems(table: Table | None, site: Site) -> list[Problem]:
+    """Tell positions of nobody, and those without the height that nothing else states."""
+    if table is None or not len(table.columns["time_s"]):
+        return []
+    if not site.vehicles:
+        return [Problem("positions.csv", "", None, "the site has no [[vehicle]] whose positions these could be")]
+    whose = table.names.get("vehicle") or (site.vehicles[0].id,) * len(table.columns["time_s"])
+    height_m = table.columns.get("z_m", np.full(len(whose), np.nan))
+    open_ones = {v.id for v in site.vehicles if v.z_m is None}
+    bare = sorted({name for name, z in zip(whose, height_m, strict=True) if name in open_ones and np.isnan(z)})
+    remedy = "has rows without z_m; give it, or state the level z_m of the [[vehicle]] in site.toml"
+    return [Problem("positions.csv", "vehicle", name, remedy) for name in bare]
 
 
 def _with_period(site: Site, sync: Table | None) -> Site:

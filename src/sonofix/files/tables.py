@@ -118,6 +118,18 @@ LAYOUTS = {
         key="vehicle",
         bounds={**TIME, **{f"g{axis}_radps": (-FASTEST_RADPS, FASTEST_RADPS, "rad/s") for axis in "xyz"}},
     ),
+    "positions": Layout(
+        ("time_s", "x_m", "y_m"),
+        ("z_m", "sd_m"),
+        given=("time_s", "x_m", "y_m"),
+        per_vehicle=True,
+        key="vehicle",
+        bounds={
+            **TIME,
+            **{f"{axis}_m": (-FARTHEST_M, FARTHEST_M, "m") for axis in "xyz"},
+            "sd_m": (1e-9, FARTHEST_M, "m"),
+        },
+    ),
     "temperature": Layout(("time_s", "temperature_c"), bounds={**TIME, "temperature_c": (-40.0, 60.0, "°C")}),
     "start": Layout(
         ("x_m", "y_m", "yaw_rad"),

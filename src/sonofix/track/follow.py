@@ -14,7 +14,7 @@ from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
 from sonofix.site import Site
-from sonofix.track import stated
+from sonofix.track import loose, stated
 from sonofix.track.alone import Alone, Silence, apart, unled
 from sonofix.track.bank import Bank
 from sonofix.track.belief import (
@@ -173,7 +173,7 @@ class Follower:
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
     ) -> tuple[tuple[Estimate, ...], NDArray[np.bool_], tuple[Event, ...]]:
-        """Take in one epoch.
+        """Take in one epoch; or, where it has no ranges, fixes that others made.
 
         Returns
         -------
@@ -184,6 +184,7 @@ class Follower:
         links = link(self.site, epoch.emitter, epoch.receiver)
         time_s = self._time(epoch, links)
         events: list[Event] = []
+        loosely = not len(epoch) and any(found.status == "ok" for found in fixes)
         if not self.belief.placed.any() and not self._recent:
             # a recording may begin before its clock's zero
             self.belief = replace(self.belief, time_s=min(self.belief.time_s, time_s))
@@ -193,6 +194,8 @@ class Follower:
         for found in fixes:
             if found.status == "ok":
                 candidates &= found.used | np.isnan(found.residual_m)
+        if loosely:
+            return self._stand(links, fixes, events), np.zeros(0, bool), tuple(events)
         self._clock(epoch, fixes)
         self._gather(epoch)
         taken = self._place(links, fixes, events)
@@ -216,6 +219,23 @@ class Follower:
         self._judge(epoch, links, used, fixes, events)
         self._prove_start(fixes, events)
         return self._estimates(links, used), used, tuple(events)
+
+    def _stand(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> tuple[Estimate, ...]:
+        """Take in positions that others computed; return estimates."""
+        self._place(links, fixes, events)
+        anew = {event.vehicle for event in events if event.event in ("start", "reset")}
+        entered = np.array([vehicle.id in anew for vehicle in self.site.vehicles], bool)
+        for who, found in enumerate(fixes):
+            if found.status != "ok" or entered[who]:
+                continue
+            self.belief, entered[who] = loose.take(self.belief, who, found, self._arms[who])
+            self._refused[who] = 0 if entered[who] else self._refused[who] + 1
+            if not entered[who]:
+                text = "a position far from the track: not believed"
+                events.append(Event(self.belief.time_s, found.vehicle, "excluded", text))
+        self.belief = set_out(self._course.head(self.belief))
+        placed = np.flatnonzero(self.belief.placed).tolist()
+        return tuple(estimate(self.belief, self.site, who, "fused" if entered[who] else "predicted") for who in placed)
 
     def time_of(self, epoch: RangeEpoch) -> float:
         """Return the instant an epoch's state will belong to."""
