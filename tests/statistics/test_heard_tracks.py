@@ -265,6 +265,6 @@ def test_table_of_tracks_from_waveforms(workers: Executor) -> None:
             f"| {kind.name} | {count} | {1000 * rms:.2f} mm | {mean:.2f} ± {sd:.2f} | {100 * inside:.1f} % | {turn} |"
         )
         told[kind.name] = (mean, sd)
-    # within three deviations of 1; a covariance a quarter too large or small at most is told as such, not hidden
+    # never too sure: within three deviations of 1, or below; by how much below, the table tells
     for name, (mean, sd) in told.items():
-        assert mean < 1 + 3 * sd + 0.25, name
+        assert mean < 1 + 3 * sd, name
