@@ -21,7 +21,9 @@ _MOST_DRAWN = 5000
 
 
 def run(
-    recording: Annotated[Path, typer.Argument(help="Recording folder: site.toml, and samples, ranges or exchanges.")],
+    recording: Annotated[
+        Path, typer.Argument(help="Recording folder: site.toml, and samples, ranges, exchanges or positions.")
+    ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder to write to. [default: out/ in the recording]")
     ] = None,
