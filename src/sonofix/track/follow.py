@@ -35,6 +35,7 @@ from sonofix.track.course import Course
 from sonofix.track.held import hold
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
+from sonofix.track.rest import Rest
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, begun, beside, follows, image
 from sonofix.track.update import linear, strangeness, update, weighed_rows
 from sonofix.track.wheels import AS_EXPECTED
@@ -123,6 +124,7 @@ class Follower:
         self._panel = Panel() if alone and few else None
         self._alone: Alone | None = None
         self._silence = Silence()
+        self._rest = Rest(site)
 
     def copied(self) -> Follower:
         """Return a follower that is as this one is now, and goes its own way from here."""
@@ -217,6 +219,7 @@ class Follower:
         self._doubt_wheels(before, epoch, links, candidates, events)
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
+        events += self._rest.take(self.belief)
         self._prove_start(fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
@@ -234,6 +237,7 @@ class Follower:
                 text = "a position far from the track: not believed"
                 events.append(Event(self.belief.time_s, found.vehicle, "excluded", text))
         self.belief = set_out(self._course.head(self.belief))
+        events += self._rest.take(self.belief)
         placed = np.flatnonzero(self.belief.placed).tolist()
         return tuple(estimate(self.belief, self.site, who, "fused" if entered[who] else "predicted") for who in placed)
 
