@@ -17,6 +17,7 @@ from sonofix.ranging import stated_epochs
 from sonofix.receiver import Receiver
 from sonofix.records import Event, Fix, Insight, RangeEpoch, Recording, Step
 from sonofix.signals.waveform import waveforms_of
+from sonofix.site import Site
 from sonofix.street import Street
 from sonofix.track.follow import Follower
 from sonofix.track.smooth import FixedLag, smooth
@@ -59,7 +60,7 @@ def run(recording: Recording, rate_hz: float | None = None, held: Collection[str
             "the recording holds neither samples (capture.flac, capture.wav) nor ranges.csv, exchanges.csv or "
             "positions.csv"
         )
-    street = Street(recording.site, recording.tables.get("start"), rate_hz)
+    street = Street(_site_of(recording), recording.tables.get("start"), rate_hz)
     street.sense(recording.tables, _stated_pairs(recording), held)
     for epoch, fixes in heard:
         yield street.walk(epoch, fixes=fixes)
@@ -111,7 +112,7 @@ def smoothed(
             raise ValueError("a graph smooths between a recording's ends; leave out either the graph or the lag")
         yield from _lagging(recording, steps, rate_hz, lag_s, held)
         return
-    if graph and recording.blocks is None and recording.ranges is None and "positions" in recording.tables:
+    if graph and _by_positions(recording):
         raise ValueError("a graph is made of ranges; positions.csv is smoothed without it (--smooth)")
     kept = list(steps)
     if not kept:
@@ -146,10 +147,25 @@ def _lagging(
 
 def _beginning(recording: Recording, time_s: float, held: Collection[str]) -> Follower:
     """Return a follower of a recording as `run` begins with one at the first epoch."""
-    street = Street(recording.site, recording.tables.get("start"))
+    street = Street(_site_of(recording), recording.tables.get("start"))
     street.sense(recording.tables, _stated_pairs(recording), held)
     street.begin(time_s)
     return street.follower
+
+
+def _by_positions(recording: Recording) -> bool:
+    """Whether a recording holds nothing but positions to make a track of."""
+    ranged = recording.blocks is not None or recording.ranges is not None or "exchanges" in recording.tables
+    return not ranged and "positions" in recording.tables
+
+
+def _site_of(recording: Recording) -> Site:
+    """Return a recording's site; where positions are of vehicles' origins, nothing rides on these."""
+    site = recording.site
+    if not _by_positions(recording):
+        return site
+    fixed = tuple(beacon for beacon in site.beacons if beacon.vehicle is None)
+    return site.model_copy(update={"beacons": fixed, "microphones": ()})
 
 
 def _stated_pairs(recording: Recording) -> tuple[tuple[str, str], ...] | None:

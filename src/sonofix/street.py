@@ -37,6 +37,8 @@ class Street:
     ) -> None:
         self.site = site
         self.rate_hz = rate_hz
+        if not 0.0 <= late_s < np.inf:
+            raise ValueError(f"late_s is {late_s}; epochs come late by a number of seconds from 0 on")
         self._late_s = late_s
         self._rewinder: Rewinder | None = None
         self.follower = Follower(site, Motion(), site.free_running, gather(site, {}))

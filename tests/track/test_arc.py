@@ -52,7 +52,7 @@ def test_an_arc_is_the_integral_of_its_motion(turn_radps: float, dt_s: float, rn
     belief = replace(belief, bends=np.ones(1, bool), tilt_sd_rad=None)
     belief.free[8:SIZE] = False
     belief.covariance[8:SIZE, :] = belief.covariance[:, 8:SIZE] = 0.0
-    still = Motion(0.0, 0.0, 0.0, 0.0, arc_psd=0.0)
+    still = Motion(0.0, 0.0, 0.0, 0.0)
     aged = predict(belief, belief.time_s + dt_s, still)
     np.testing.assert_allclose(aged.mean, moved(belief.mean, dt_s), atol=1e-8)
     step = 1e-5
@@ -116,7 +116,7 @@ def test_between_epochs_it_keeps_to_the_circle(arms_m: tuple, rng: np.random.Gen
         assert np.mean(sigmas) < 2.0
     # straight on misses a circle by v² dt²/2r, ten centimetres
     assert away[False] > 0.08
-    assert away[True] < 0.2 * away[False]
+    assert away[True] < 0.35 * away[False]
 
 
 def test_a_vehicle_that_stands_forgets_how_it_turned(rng: np.random.Generator) -> None:
@@ -154,7 +154,7 @@ def test_tracks_drawn_from_the_model_are_as_uncertain_as_stated(seed: int) -> No
                 cos, sin = np.cos(turn * dt), np.sin(turn * dt)
                 before = velocity
                 velocity = np.array([[cos, -sin], [sin, cos]]) @ velocity
-                velocity = velocity + np.sqrt(motion.arc_psd * dt) * rng.standard_normal(2)
+                velocity = velocity + np.sqrt(motion.acceleration_psd * dt) * rng.standard_normal(2)
                 place = place + dt * (before + velocity) / 2
                 left = np.exp(-dt / STRAIGHT_S)
                 turn = left * turn + TURN_SD_RADPS * np.sqrt(1 - left**2) * rng.standard_normal()

@@ -41,6 +41,8 @@ class _Belief:
     off_mps: float
     """By how much the ranges' speed is above what the thermometer gives."""
     sd_mps: float
+    told_mps: float
+    """What the thermometer gave when it was learnt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,11 +124,12 @@ class SoundSpeed:
         if prior is None:
             return epoch, solve(epoch), ()
         asked = with_sound_speed(epoch, *prior)
+        self._last_mps = prior[0]
         fixes = solve(asked)
         best = _best(fixes)
         self._refused = self._refused + 1 if best is None and any(f.status == "inconsistent" for f in fixes) else 0
         if best is not None:
-            self._belief = _Belief(epoch.sync_s, best[0] - epoch.sound_speed_mps, best[1])
+            self._belief = _Belief(epoch.sync_s, best[0] - epoch.sound_speed_mps, best[1], epoch.sound_speed_mps)
             self._last_mps = best[0]
         elif self._refused >= PATIENCE:
             self._belief, self._refused, self._last_mps = None, 0, epoch.sound_speed_mps
@@ -138,7 +141,9 @@ class SoundSpeed:
         if self._belief is not None:
             aged_s = max(epoch.sync_s - self._belief.time_s, 0.0)
             aged_sd_mps = float(np.hypot(self._belief.sd_mps, WANDER_MPS * np.sqrt(aged_s / WANDER_S)))
-            return epoch.sound_speed_mps + self._belief.off_mps, min(aged_sd_mps, sd_mps)
+            # whether the air has changed, or the thermometer only rounds, is for the ranges to say
+            changed_mps = epoch.sound_speed_mps - self._belief.told_mps
+            return epoch.sound_speed_mps + self._belief.off_mps, float(np.hypot(min(aged_sd_mps, sd_mps), changed_mps))
         found = _best(solve(with_sound_speed(epoch, epoch.sound_speed_mps, DOUBTED * sd_mps)))
         # the speed comes from this very epoch: what is believed of it beforehand stays as wide as before it spoke
         return (found[0], DOUBTED * sd_mps) if found is not None and found[1] < LEARNT * sd_mps else None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from sonofix.locate.fix import fix
-from sonofix.records import Fix, RangeEpoch, Table
+from sonofix.records import Fix, Floats, RangeEpoch, Table
 from sonofix.site import Site
 
 WITHOUT_SD_M = 0.1
@@ -15,7 +15,7 @@ WITHOUT_SD_M = 0.1
 
 
 def told_fixes(table: Table, site: Site) -> Iterator[tuple[RangeEpoch, tuple[Fix, ...]]]:
-    """Make each row of `positions.csv` an epoch without ranges, and the fixes of all vehicles: its own is as stated.
+    """Make rows of one instant of `positions.csv` an epoch without ranges, and fixes of all vehicles as they state.
 
     ``table`` holds `time_s`, `x_m`, `y_m`, perhaps `z_m` and `sd_m` of each axis, and `vehicle`. The level of a vehicle
     that has one (`z_m` of the site) stands above that of a row.
@@ -23,32 +23,51 @@ def told_fixes(table: Table, site: Site) -> Iterator[tuple[RangeEpoch, tuple[Fix
     columns, count = table.columns, len(table.columns["time_s"])
     whose = table.names.get("vehicle") or (site.vehicles[0].id,) * count
     sd_m = np.full(count, np.nan) if "sd_m" not in columns else columns["sd_m"]
-    sd_m = np.where(np.isnan(sd_m), WITHOUT_SD_M, sd_m)
+    sds_m: list[float] = np.where(np.isnan(sd_m), WITHOUT_SD_M, sd_m).tolist()
     height_m = columns.get("z_m", np.full(count, np.nan))
-    for i in np.argsort(columns["time_s"], kind="stable").tolist():
-        epoch = _silent(i, float(columns["time_s"][i]), site)
-        level_m = site.vehicle(whose[i]).z_m
-        states = ("x", "y", "z") if level_m is None else ("x", "y")
-        place = np.array([columns["x_m"][i], columns["y_m"][i], height_m[i] if level_m is None else level_m])
-        own = Fix(
-            time_s=epoch.sync_s,
-            vehicle=whose[i],
-            status="ok",
-            remedy="",
-            states=states,
-            position_m=place,
-            velocity_mps=None,
-            yaw_rad=None,
-            clock_offset_m=None,
-            covariance=sd_m[i] ** 2 * np.eye(len(states)),
-            hdop=None,
-            vdop=None,
-            hpl_m=None,
-            vpl_m=None,
-            used=np.zeros(0, bool),
-            residual_m=np.zeros(0),
-        )
-        yield epoch, tuple(own if v.id == whose[i] else fix(epoch, site, v.id) for v in site.vehicles)
+    order = np.argsort(columns["time_s"], kind="stable")
+    for k, time_s in enumerate(np.unique(columns["time_s"]).tolist()):
+        epoch = _silent(k, time_s, site)
+        own: dict[str, Fix] = {}
+        for i in order[columns["time_s"][order] == time_s].tolist():
+            level_m = site.vehicle(whose[i]).z_m
+            z = height_m[i] if level_m is None else level_m
+            place = np.array([columns["x_m"][i], columns["y_m"][i], z])
+            own[whose[i]] = _told(epoch, whose[i], place, ("x", "y", "z") if level_m is None else ("x", "y"), sds_m[i])
+        yield epoch, tuple(own.get(v.id, _untold(epoch, v.id)) for v in site.vehicles)
+
+
+def _told(epoch: RangeEpoch, vehicle: str, position_m: Floats, states: tuple[str, ...], sd_m: float) -> Fix:
+    """Return a fix as it is stated."""
+    return replace(
+        _untold(epoch, vehicle),
+        status="ok",
+        states=states,
+        position_m=position_m,
+        covariance=sd_m**2 * np.eye(len(states)),
+    )
+
+
+def _untold(epoch: RangeEpoch, vehicle: str) -> Fix:
+    """Return the fix of a vehicle of which an epoch tells nothing."""
+    return Fix(
+        time_s=epoch.sync_s,
+        vehicle=vehicle,
+        status="too-few",
+        remedy="no position at this instant",
+        states=(),
+        position_m=None,
+        velocity_mps=None,
+        yaw_rad=None,
+        clock_offset_m=None,
+        covariance=None,
+        hdop=None,
+        vdop=None,
+        hpl_m=None,
+        vpl_m=None,
+        used=np.zeros(0, bool),
+        residual_m=np.zeros(0),
+    )
 
 
 def _silent(index: int, time_s: float, site: Site) -> RangeEpoch:

@@ -41,8 +41,7 @@ class Motion:
 
     ``acceleration_psd`` in m²/s³ per horizontal axis, ``climb_psd`` upwards (vehicles keep to floors), ``turn_psd`` in
     rad²/s³, ``clock_psd`` in m²/s³ of the clock's drift. Roll and pitch of a body that tilts come back upright at
-    ``tilt_pace_radps``, the natural frequency of `tilt.rock`. Of vehicles that drive in arcs (`bend`) the acceleration
-    has ``arc_psd``, m²/s³, in place of ``acceleration_psd``.
+    ``tilt_pace_radps``, the natural frequency of `tilt.rock`.
     """
 
     acceleration_psd: float = 0.5
@@ -50,7 +49,6 @@ class Motion:
     turn_psd: float = 0.3
     clock_psd: float = 1e-6
     tilt_pace_radps: float = 2.0
-    arc_psd: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,8 +220,8 @@ def drift(mean, covariance, at, rate, free, density, dt):
 def age(mean, covariance, free, placed, bends, densities, dt):
     """Move a belief's ``mean`` and ``covariance`` by ``dt``, in place.
 
-    ``densities`` (5,) are those of `Motion`: along a horizontal axis, upwards, of turns, of the clock's drift, and of
-    vehicles that drive in arcs, ``bends`` (V,).
+    ``densities`` (4,) are those of `Motion`: along a horizontal axis, upwards, of turns, and of the clock's drift;
+    ``bends`` (V,) are vehicles that drive in arcs.
     The noise of an integrated pair is that of white acceleration (Bar-Shalom 2001, eq 6.2.2-12).
     """
     n = len(mean)
@@ -237,7 +235,7 @@ def age(mean, covariance, free, placed, bends, densities, dt):
             continue
         elif bends[vehicle] and part < 2:
             if part == 0:
-                bend(mean, covariance, free, vehicle, densities[4], dt)
+                bend(mean, covariance, free, vehicle, density, dt)
             continue
         # a course's rate of turn is free without a heading
         if not free[rate] or not (free[at] or part < 3 or pair == 4 * len(placed)):
@@ -257,7 +255,7 @@ def predict(belief: Belief, time_s: float, motion: Motion) -> Belief:
     if (abs(dt) < INSTANT_S and not told) or not belief.placed.any():
         return replace(belief, time_s=time_s)
     mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free
-    densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd, motion.arc_psd])
+    densities = np.array([motion.acceleration_psd, motion.climb_psd, motion.turn_psd, motion.clock_psd])
     bends = np.zeros(len(belief.placed), bool) if belief.bends is None else belief.bends
     inputs, now_s = belief.inputs, belief.time_s
     if inputs is None:

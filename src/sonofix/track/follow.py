@@ -231,10 +231,11 @@ class Follower:
         for who, found in enumerate(fixes):
             if found.status != "ok" or entered[who]:
                 continue
-            self.belief, entered[who] = loose.take(self.belief, who, found, self._arms[who])
+            self.belief, off = loose.take(self.belief, who, found)
+            entered[who] = off <= loose.UNLIKELY
             self._refused[who] = 0 if entered[who] else self._refused[who] + 1
             if not entered[who]:
-                text = "a position far from the track: not believed"
+                text = f"a position {off:.1f} deviations from the track: not believed"
                 events.append(Event(self.belief.time_s, found.vehicle, "excluded", text))
         self.belief = set_out(self._course.head(self.belief))
         events += self._rest.take(self.belief)

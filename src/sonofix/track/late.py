@@ -1,6 +1,6 @@
 """Epochs that come late or out of order: the track goes back to before them, and takes in anew what came since.
 
-Nothing is approximated: whatever the order in which epochs within the window come, the track ends as if each had come
+Whatever the order in which epochs within the window come, the track ends as if the same ranges and fixes had come each
 at its time.
 """
 

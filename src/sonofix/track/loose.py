@@ -10,34 +10,34 @@ from dataclasses import replace
 
 import numpy as np
 
-from sonofix.geometry import SIZE, from_arm
-from sonofix.records import Fix, Floats
+from sonofix.geometry import SIZE
+from sonofix.records import Fix
 from sonofix.track.belief import Belief
 from sonofix.track.kernel import joseph
 
-UNLIKELY = 16.0
-"""Squared distance of a position from the track, over its variance, beyond which it is not believed: noise alone comes
+UNLIKELY = 4.0
+"""Distance of a position from the track, in deviations, beyond which it is not believed: noise alone comes
 there three times in ten thousand, and one that is left out costs little."""
 
 
-def take(belief: Belief, vehicle: int, fix: Fix, arm: Floats) -> tuple[Belief, bool]:
-    """Correct where a vehicle is by a fix of that instant; return whether it was believed.
+def take(belief: Belief, vehicle: int, fix: Fix) -> tuple[Belief, float]:
+    """Correct where a vehicle is by a fix of that instant, if it is believed; return by how many deviations it is off.
 
-    ``arm`` (2,) is its `geometry.open_arms`: the track follows that point, the fix tells the origin.
+    The track follows the vehicle's origin, of which a fix tells.
     """
     assert fix.position_m is not None
     assert fix.covariance is not None
     at, n = SIZE * vehicle, len(belief.mean)
     axes = [i for i, name in enumerate("xyz") if name in fix.states and belief.free[at + i]]
     rows = [fix.states.index("xyz"[i]) for i in axes]
-    shift, aside_m = from_arm(arm, belief.mean[at + 4 : at + 7])
-    miss = (fix.position_m - belief.mean[at : at + 3] - np.append(shift, 0.0))[axes]
+    miss = (fix.position_m - belief.mean[at : at + 3])[axes]
     derivative = np.eye(n)[[at + i for i in axes]]
-    noise = fix.covariance[np.ix_(rows, rows)] + aside_m**2 * np.eye(len(rows))
+    noise = fix.covariance[np.ix_(rows, rows)]
     crossed = derivative @ belief.covariance
     expected = crossed @ derivative.T + noise
-    if miss @ np.linalg.solve(expected, miss) > UNLIKELY:
-        return belief, False
+    off = float(np.sqrt(miss @ np.linalg.solve(expected, miss)))
+    if off > UNLIKELY:
+        return belief, off
     gain = np.linalg.solve(expected, crossed).T
     covariance = joseph(belief.covariance, gain, derivative, noise)
-    return replace(belief, mean=belief.mean + gain @ miss, covariance=covariance), True
+    return replace(belief, mean=belief.mean + gain @ miss, covariance=covariance), off
