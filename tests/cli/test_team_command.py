@@ -198,6 +198,25 @@ def test_what_is_wrong_with_samples_is_told_as_of_one_vehicle(sounding, tmp_path
         assert track["nees_xy"] < 4.0
 
 
+@pytest.mark.parametrize("source", ["ranges", "samples"])
+def test_ranges_but_for_an_unknown_offset_are_refused(folder, sounding, tmp_path, source):
+    place = tmp_path / "unknown"
+    shutil.copytree(folder if source == "ranges" else sounding, place)
+    text = (place / "site.toml").read_text("utf-8")
+    schedule = "[schedule]\nperiod_s = 0.4\nsynchronised = false\n"
+    changed = (
+        text.replace("synchronised = true", "synchronised = false") if source == "samples" else text + "\n" + schedule
+    )
+    assert changed.count("synchronised = false") == 1
+    (place / "site.toml").write_text(changed, "utf-8")
+    done = run("team", place, "-o", tmp_path / "out", "--no-plot")
+    assert done.exit_code == 2
+    told = " ".join(done.stderr.split())
+    for words in ("site.toml: schedule.synchronised = false", "exchanges.csv", "own_clocks", "sonofix run"):
+        assert words in told
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sonofix.records import RangeRows, Recording, Table
-from sonofix.site import Site
+from sonofix.site import Pair, Site
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
-from sonofix.team.fleet import follow
+from sonofix.team.fleet import follow, instants
 from sonofix.team.message import BYTES, TOLD, Message, unpack
 from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth
@@ -348,10 +348,67 @@ def test_messages_come_through_and_are_small():
     np.testing.assert_array_equal(got.mean[:3], sent.mean[:3])
 
 
+@pytest.mark.parametrize("sd_m", [None, 0.04])
+def test_biases_of_pairs_are_taken_off_ranges(sd_m):
+    recording, _ = fleet(seconds=3)
+    heard = recording.ranges
+    assert heard is not None
+    stated = None if sd_m is None else np.full(len(heard.time_s), sd_m)
+    pairs = {("L0", "R0"): (0.5, 0.03), ("R1", "R2"): (-0.2, 0.0)}
+    told = [{"from": a, "to": b, "bias_m": bias, "bias_sd_m": sd} for (a, b), (bias, sd) in pairs.items()]
+    site = recording.site.model_copy(update={"pairs": tuple(Pair.model_validate(one) for one in told)})
+    too_long = [pairs.get(ends, (0.0, 0.0))[0] for ends in zip(heard.emitter, heard.receiver, strict=True)]
+    ranges = replace(heard, range_m=heard.range_m + too_long, sd_m=stated)
+    plain = gather(replace(recording, ranges=replace(heard, sd_m=stated)))
+    feed = gather(replace(recording, site=site, ranges=ranges))
+    np.testing.assert_allclose(feed.range_m, plain.range_m, atol=1e-12)
+    doubted = np.array([ends == ("L0", "R0") for ends in feed.ends])
+    assert 0 < doubted.sum() < len(doubted)
+    np.testing.assert_allclose(feed.range_sd_m[doubted], np.hypot(sd_m or 0.0, 0.03))
+    np.testing.assert_array_equal(feed.range_sd_m[~doubted], np.nan if sd_m is None else sd_m)
+    # what a receiver made has them off already
+    np.testing.assert_array_equal(gather(replace(recording, site=site), heard).range_m, plain.range_m)
+
+
+def test_silences_are_filled_until_all_have_left():
+    recording, _ = fleet(seconds=30, seed=5, silent=dict.fromkeys(range(3), (10.0, 20.0)))
+    feed = gather(recording)
+    times = [time_s for time_s, *_ in instants(feed)]
+    # short ones throughout
+    assert max(np.diff(times)) < 1.0 + 1e-9
+    late_s = 1.7e9
+    after = feed.time_s > 15.0
+    told = feed.odometry_s > 15.0
+    moved = replace(
+        feed,
+        time_s=feed.time_s + late_s * after,
+        odometry_s=feed.odometry_s + late_s * told,
+    )
+    moments = [m for m, _ in follow(moved)]
+    assert len(moments) < len(times) + 30
+    assert sum(event.event == "left" for m in moments for event in m.events) == 3
+    waits = np.diff([m.time_s for m in moments])
+    assert sum(waits > 1.0 + 1e-6) == 1
+    # while odometry comes, all of it is filled
+    driving = feed.keep((feed.time_s < 1.0) | (feed.time_s > 29.0))
+    filled = replace(driving, odometry_s=feed.odometry_s)
+    assert max(np.diff([time_s for time_s, *_ in instants(filled)])) < 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_odometry_of_another_clock_is_told(made):
+    recording, _ = fleet(seconds=3)
+    odometry = recording.tables["odometry"]
+    unix = replace(odometry, columns={**odometry.columns, "time_s": odometry.columns["time_s"] + 1.7e9})
+    recording = replace(recording, tables={**recording.tables, "odometry": unix})
+    with pytest.raises(
+        ValueError, match=rf"odometry\.csv.*{'exchanges' if made else 'ranges'}\.csv, bearings.*one clock"
+    ):
+        gather(recording, recording.ranges if made else None)
+
+
 def test_a_recording_without_odometry_says_so():
     recording, _ = fleet(seconds=5)
     tables = {name: table for name, table in recording.tables.items() if name != "odometry"}
-    from dataclasses import replace
-
     with pytest.raises(ValueError, match=r"odometry\.csv"):
         gather(replace(recording, tables=tables))

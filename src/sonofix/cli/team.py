@@ -89,6 +89,7 @@ def _run(
 
     recording = files.read_recording(folder, to_run="bearings" not in _stems(folder))
     _check(recording, landmarks_of)
+    _check_clock(recording)
     truths = files.read_truth(folder)
     kept: list[Step] = []
     moments: list[Moment] = []
@@ -182,6 +183,21 @@ def _check(recording: Recording, landmarks_of: list[str] | None) -> None:
     for name in landmarks_of or ():
         if name not in ids:
             raise ValueError(f"--landmarks-of {name}: no vehicle of the site; it has {', '.join(ids)}")
+
+
+def _check_clock(recording: Recording) -> None:
+    """Raise ValueError where ranges hold an unknown offset, which robots' filters have no state for."""
+    site = recording.site
+    if site.clock_known or (recording.blocks is None and recording.ranges is None):
+        return
+    free = site.schedule is not None and not site.schedule.synchronised
+    field = "schedule.synchronised = false" if free else "beacon.code.distance_m is not stated"
+    made = "those of samples" if recording.blocks is not None else "ranges.csv"
+    raise ValueError(
+        f"site.toml: {field}, so ranges ({made}) are known but for an offset, and a team needs whole ones; "
+        + ("set it to true where no offset is left, give exchanges.csv alone, " if free else "state it, ")
+        + "let robots range each other two-way (own_clocks = true), or run it with: sonofix run"
+    )
 
 
 def _feed(recording: Recording, bar: Progress) -> tuple[Feed, Listened | None]:
