@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonofix.records import RangeRows, Recording, Table
+from sonofix.acquire import tones
+from sonofix.records import Event, RangeEpoch, RangeRows, Recording, Step, Table
 from sonofix.site import Pair, Site
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
@@ -11,7 +12,7 @@ from sonofix.team.fleet import follow, instants
 from sonofix.team.message import BYTES, TOLD, Message, unpack
 from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth
-from sonofix.team.tell import steps_of
+from sonofix.team.tell import listened, steps_of
 from team.made_fleet import errors, fleet, nees
 
 
@@ -183,12 +184,52 @@ def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
     assert belief is not None
     events = [(e.event, e.vehicle) for m in moments for e in m.events]
     assert events == [("excluded", "R1"), ("excluded", "R2")]
+    assert all("while all else agrees" in e.detail for m in moments for e in m.events)
     for r in range(3):
         for moment in (moments[-1], *smooth(feed, moments, belief, np.array(means))):
             off = moment.pose[r, :2] - starts[r][:2]
             assert off @ np.linalg.solve(moment.covariance[r, :2, :2], off) < 9.0
     moments = [m for m, _ in follow(standing(starts, starts))]
     assert not [e for m in moments for e in m.events]
+
+
+def test_where_all_else_is_refused_too_that_is_told():
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = standing(starts, starts)
+    # metres stated in millimetres
+    feed = replace(feed, range_m=1e3 * feed.range_m)
+    told = [e.detail for m, _ in follow(feed) for e in m.events if e.event == "excluded"]
+    assert len(told) == 6
+    assert all("most of what else is heard of" in text and "metres?" in text for text in told)
+    assert not any("agrees" in text for text in told)
+
+
+def test_a_tone_is_told_where_it_begins_changes_and_ends():
+    levels = {"A": (15, 15, 16, 17, 18, 18, None, None, 12, 12), "B": (2, 1, 0, -1, -2, -2, -1, -1, -1, -1)}
+    steps = []
+    for i in range(10):
+        events = [
+            Event(0.5 * i, "", "samples", f"microphone {name}: {tones.told(40e3 + 10.0 * i, level[i])}")
+            for name, level in levels.items()
+            if level[i] is not None
+        ]
+        # another of the same microphone, further off than any drifts
+        events.append(Event(0.5 * i, "", "samples", f"microphone B: {tones.told(41e3, 9.0)}"))
+        events.append(Event(0.5 * i, "", "samples", "microphone A: 3 % clipped"))
+        none = np.zeros(0)
+        epoch = RangeEpoch(i, 0.5 * i, (), (), none, none, np.zeros((0, 0)), None, None, None, "known", 343.0)
+        steps.append(Step(epoch, (), (), tuple(events), np.zeros(0, bool), none))
+    told = [(e.time_s, e.detail) for e in listened(steps).events]
+    assert sum("clipped" in text for _, text in told) == 10
+    assert [(t, text.removeprefix("microphone ")) for t, text in told if "tone" in text] == [
+        (0.0, "A: a tone at 40.000 kHz, 15 dB over all else in the band, was taken out"),
+        (0.0, "B: a tone at 40.000 kHz, 2 dB over all else in the band, was taken out"),
+        (0.0, "B: a tone at 41.000 kHz, 9 dB over all else in the band, was taken out"),
+        (1.5, "B: a tone at 40.030 kHz, 1 dB below all else in the band, was taken out"),
+        (2.0, "A: a tone at 40.040 kHz, 18 dB over all else in the band, was taken out"),
+        (3.0, "A: the tone at 40.050 kHz has ended"),
+        (4.0, "A: a tone at 40.080 kHz, 12 dB over all else in the band, was taken out"),
+    ]
 
 
 def test_smoothing_keeps_what_start_poses_tell():

@@ -344,10 +344,16 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
 
 
 def _odd(feed: Feed, odds: Odds, time_s: float) -> list[Event]:
-    text = "its ranges with {} are off by {:.2f} m, while all else agrees: one of them is elsewhere"
+    if odds.refused:
+        whose = " and ".join(feed.robots[robot] for robot in odds.refused)
+        why = f"and most of what else is heard of {whose} is refused: are start poses right, and ranges in metres?"
+    elif odds.alone:
+        why = "and little else is heard of them: one of them is elsewhere"
+    else:
+        why = "while all else agrees: one of them is elsewhere"
     names = [feed.robots[robot] for robot in odds.robots]
     return [
-        Event(time_s, name, "excluded", text.format(other, odds.miss_m))
+        Event(time_s, name, "excluded", f"its ranges with {other} are off by {odds.miss_m:.2f} m, {why}")
         for name, other in zip(names, names[::-1], strict=True)
     ]
 
