@@ -351,7 +351,7 @@ def test_deviations_hold_where_errors_of_ranges_stay():
             if emitter[0] == "L" and int(emitter[1]) < 4:
                 same = {end for end in view if view[end] == view[emitter, receiver]}
                 assert same <= {(emitter, receiver), (f"L{int(emitter[1]) + 4}", receiver)}
-        assert feed.views < feed.pairs
+        assert feed.views < len(set(feed.pair.tolist()))
         moments, belief = run(recording)
         ratios.append(nees(*errors(moments, truth, after_s=20)))
         known = [variance_of(belief.noise.known, 3, kind, 3.0) for kind in (STAYING, NEW)]

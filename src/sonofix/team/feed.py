@@ -77,11 +77,6 @@ class Feed:
     starts: dict[int, tuple[float, float, float]]
 
     @property
-    def pairs(self) -> int:
-        """How many pairs of ends there are."""
-        return int(self.pair.max()) + 1 if len(self.pair) else 0
-
-    @property
     def views(self) -> int:
         """How many views there are."""
         return int(self.view.max()) + 1 if len(self.view) else 0
