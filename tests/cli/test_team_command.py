@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from sonofix.channel import Line, simulate
 from sonofix.cli.main import app
-from sonofix.files import write_recording
+from sonofix.draw.team import draw_team
+from sonofix.files import read_recording, write_recording
 from sonofix.records import Table
 from sonofix.signals import codes
 from sonofix.signals.waveform import waveforms_of
@@ -82,6 +83,24 @@ def test_an_animation_is_drawn(folder, tmp_path):
     assert done.exit_code == 0, done.stderr
     assert (tmp_path / "team.gif").read_bytes().startswith(b"GIF8")
     assert not (tmp_path / "out" / "team.png").exists()
+
+
+def test_where_nobody_is_placed_that_is_said_and_all_is_written(folder, tmp_path):
+    place = tmp_path / "unplaced"
+    shutil.copytree(folder, place)
+    # of peers alone nobody knows where all of them are
+    for name in ("ranges.csv", "bearings.csv"):
+        head, *rows = (place / name).read_text("utf-8").splitlines()
+        (place / name).write_text("\n".join([head, *(row for row in rows if ",L" not in row)]) + "\n", "utf-8")
+    done = run("team", place, "-o", tmp_path / "out", "--animate", tmp_path / "team.gif")
+    assert done.exit_code == 0, done.stderr
+    assert "Never placed: R0, R1, R2" in done.stdout
+    assert "no robot was placed" in done.stdout
+    assert not (tmp_path / "team.gif").exists()
+    assert (tmp_path / "out" / "team.png").read_bytes().startswith(b"\x89PNG")
+    figure = draw_team(read_recording(place), [])
+    assert not figure.axes
+    assert "no robot was placed" in [text.get_text() for text in figure.texts]
 
 
 def test_exchanges_of_robots_on_clocks_of_their_own_place_them(folder, tmp_path):
@@ -196,6 +215,25 @@ def test_what_is_wrong_with_samples_is_told_as_of_one_vehicle(sounding, tmp_path
     for track in scored["track"].values():
         assert track["rmse_xy_m"] < 0.02
         assert track["nees_xy"] < 4.0
+
+
+@pytest.mark.parametrize("source", ["ranges", "samples"])
+def test_ranges_but_for_an_unknown_offset_are_refused(folder, sounding, tmp_path, source):
+    place = tmp_path / "unknown"
+    shutil.copytree(folder if source == "ranges" else sounding, place)
+    text = (place / "site.toml").read_text("utf-8")
+    schedule = "[schedule]\nperiod_s = 0.4\nsynchronised = false\n"
+    changed = (
+        text.replace("synchronised = true", "synchronised = false") if source == "samples" else text + "\n" + schedule
+    )
+    assert changed.count("synchronised = false") == 1
+    (place / "site.toml").write_text(changed, "utf-8")
+    done = run("team", place, "-o", tmp_path / "out", "--no-plot")
+    assert done.exit_code == 2
+    told = " ".join(done.stderr.split())
+    for words in ("site.toml: schedule.synchronised = false", "exchanges.csv", "own_clocks", "sonofix run"):
+        assert words in told
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -84,6 +84,11 @@ def test_panels_show_growth_and_places(sheet: Sheet) -> None:
     assert planned.logarithmic
 
 
+@pytest.mark.parametrize(("runs", "claim"), [(1, ""), (robots_leapfrog.FEW, "0.7 to 1.4")])
+def test_nothing_is_expected_of_too_few_runs(runs: int, claim: str) -> None:
+    assert robots_leapfrog.ratio(np.ones((runs, 2)), np.tile(np.eye(2), (runs, 1, 1)), "").claim == claim
+
+
 def test_a_robot_that_hears_nobody_ends_the_run_with_a_reason() -> None:
     deaf = robots_stops.Heard((), np.zeros(0), np.zeros((0, 0)))
     with pytest.raises(RuntimeError, match="all range each other"):

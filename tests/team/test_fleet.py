@@ -3,15 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonofix.records import RangeRows, Recording, Table
-from sonofix.site import Site
+from sonofix.acquire import tones
+from sonofix.records import Event, RangeEpoch, RangeRows, Recording, Step, Table
+from sonofix.site import Pair, Site
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
-from sonofix.team.fleet import follow
+from sonofix.team.fleet import follow, instants
 from sonofix.team.message import BYTES, TOLD, Message, unpack
 from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth
-from sonofix.team.tell import steps_of
+from sonofix.team.tell import listened, steps_of
 from team.made_fleet import errors, fleet, nees
 
 
@@ -183,12 +184,52 @@ def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
     assert belief is not None
     events = [(e.event, e.vehicle) for m in moments for e in m.events]
     assert events == [("excluded", "R1"), ("excluded", "R2")]
+    assert all("while all else agrees" in e.detail for m in moments for e in m.events)
     for r in range(3):
         for moment in (moments[-1], *smooth(feed, moments, belief, np.array(means))):
             off = moment.pose[r, :2] - starts[r][:2]
             assert off @ np.linalg.solve(moment.covariance[r, :2, :2], off) < 9.0
     moments = [m for m, _ in follow(standing(starts, starts))]
     assert not [e for m in moments for e in m.events]
+
+
+def test_where_all_else_is_refused_too_that_is_told():
+    starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
+    feed = standing(starts, starts)
+    # metres stated in millimetres
+    feed = replace(feed, range_m=1e3 * feed.range_m)
+    told = [e.detail for m, _ in follow(feed) for e in m.events if e.event == "excluded"]
+    assert len(told) == 6
+    assert all("most of what else is heard of" in text and "metres?" in text for text in told)
+    assert not any("agrees" in text for text in told)
+
+
+def test_a_tone_is_told_where_it_begins_changes_and_ends():
+    levels = {"A": (15, 15, 16, 17, 18, 18, None, None, 12, 12), "B": (2, 1, 0, -1, -2, -2, -1, -1, -1, -1)}
+    steps = []
+    for i in range(10):
+        events = [
+            Event(0.5 * i, "", "samples", f"microphone {name}: {tones.told(40e3 + 10.0 * i, level[i])}")
+            for name, level in levels.items()
+            if level[i] is not None
+        ]
+        # another of the same microphone, further off than any drifts
+        events.append(Event(0.5 * i, "", "samples", f"microphone B: {tones.told(41e3, 9.0)}"))
+        events.append(Event(0.5 * i, "", "samples", "microphone A: 3 % clipped"))
+        none = np.zeros(0)
+        epoch = RangeEpoch(i, 0.5 * i, (), (), none, none, np.zeros((0, 0)), None, None, None, "known", 343.0)
+        steps.append(Step(epoch, (), (), tuple(events), np.zeros(0, bool), none))
+    told = [(e.time_s, e.detail) for e in listened(steps).events]
+    assert sum("clipped" in text for _, text in told) == 10
+    assert [(t, text.removeprefix("microphone ")) for t, text in told if "tone" in text] == [
+        (0.0, "A: a tone at 40.000 kHz, 15 dB over all else in the band, was taken out"),
+        (0.0, "B: a tone at 40.000 kHz, 2 dB over all else in the band, was taken out"),
+        (0.0, "B: a tone at 41.000 kHz, 9 dB over all else in the band, was taken out"),
+        (1.5, "B: a tone at 40.030 kHz, 1 dB below all else in the band, was taken out"),
+        (2.0, "A: a tone at 40.040 kHz, 18 dB over all else in the band, was taken out"),
+        (3.0, "A: the tone at 40.050 kHz has ended"),
+        (4.0, "A: a tone at 40.080 kHz, 12 dB over all else in the band, was taken out"),
+    ]
 
 
 def test_smoothing_keeps_what_start_poses_tell():
@@ -310,7 +351,7 @@ def test_deviations_hold_where_errors_of_ranges_stay():
             if emitter[0] == "L" and int(emitter[1]) < 4:
                 same = {end for end in view if view[end] == view[emitter, receiver]}
                 assert same <= {(emitter, receiver), (f"L{int(emitter[1]) + 4}", receiver)}
-        assert feed.views < feed.pairs
+        assert feed.views < len(set(feed.pair.tolist()))
         moments, belief = run(recording)
         ratios.append(nees(*errors(moments, truth, after_s=20)))
         known = [variance_of(belief.noise.known, 3, kind, 3.0) for kind in (STAYING, NEW)]
@@ -348,10 +389,67 @@ def test_messages_come_through_and_are_small():
     np.testing.assert_array_equal(got.mean[:3], sent.mean[:3])
 
 
+@pytest.mark.parametrize("sd_m", [None, 0.04])
+def test_biases_of_pairs_are_taken_off_ranges(sd_m):
+    recording, _ = fleet(seconds=3)
+    heard = recording.ranges
+    assert heard is not None
+    stated = None if sd_m is None else np.full(len(heard.time_s), sd_m)
+    pairs = {("L0", "R0"): (0.5, 0.03), ("R1", "R2"): (-0.2, 0.0)}
+    told = [{"from": a, "to": b, "bias_m": bias, "bias_sd_m": sd} for (a, b), (bias, sd) in pairs.items()]
+    site = recording.site.model_copy(update={"pairs": tuple(Pair.model_validate(one) for one in told)})
+    too_long = [pairs.get(ends, (0.0, 0.0))[0] for ends in zip(heard.emitter, heard.receiver, strict=True)]
+    ranges = replace(heard, range_m=heard.range_m + too_long, sd_m=stated)
+    plain = gather(replace(recording, ranges=replace(heard, sd_m=stated)))
+    feed = gather(replace(recording, site=site, ranges=ranges))
+    np.testing.assert_allclose(feed.range_m, plain.range_m, atol=1e-12)
+    doubted = np.array([ends == ("L0", "R0") for ends in feed.ends])
+    assert 0 < doubted.sum() < len(doubted)
+    np.testing.assert_allclose(feed.range_sd_m[doubted], np.hypot(sd_m or 0.0, 0.03))
+    np.testing.assert_array_equal(feed.range_sd_m[~doubted], np.nan if sd_m is None else sd_m)
+    # what a receiver made has them off already
+    np.testing.assert_array_equal(gather(replace(recording, site=site), heard).range_m, plain.range_m)
+
+
+def test_silences_are_filled_until_all_have_left():
+    recording, _ = fleet(seconds=30, seed=5, silent=dict.fromkeys(range(3), (10.0, 20.0)))
+    feed = gather(recording)
+    times = [time_s for time_s, *_ in instants(feed)]
+    # short ones throughout
+    assert max(np.diff(times)) < 1.0 + 1e-9
+    late_s = 1.7e9
+    after = feed.time_s > 15.0
+    told = feed.odometry_s > 15.0
+    moved = replace(
+        feed,
+        time_s=feed.time_s + late_s * after,
+        odometry_s=feed.odometry_s + late_s * told,
+    )
+    moments = [m for m, _ in follow(moved)]
+    assert len(moments) < len(times) + 30
+    assert sum(event.event == "left" for m in moments for event in m.events) == 3
+    waits = np.diff([m.time_s for m in moments])
+    assert sum(waits > 1.0 + 1e-6) == 1
+    # while odometry comes, all of it is filled
+    driving = feed.keep((feed.time_s < 1.0) | (feed.time_s > 29.0))
+    filled = replace(driving, odometry_s=feed.odometry_s)
+    assert max(np.diff([time_s for time_s, *_ in instants(filled)])) < 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_odometry_of_another_clock_is_told(made):
+    recording, _ = fleet(seconds=3)
+    odometry = recording.tables["odometry"]
+    unix = replace(odometry, columns={**odometry.columns, "time_s": odometry.columns["time_s"] + 1.7e9})
+    recording = replace(recording, tables={**recording.tables, "odometry": unix})
+    with pytest.raises(
+        ValueError, match=rf"odometry\.csv.*{'exchanges' if made else 'ranges'}\.csv, bearings.*one clock"
+    ):
+        gather(recording, recording.ranges if made else None)
+
+
 def test_a_recording_without_odometry_says_so():
     recording, _ = fleet(seconds=5)
     tables = {name: table for name, table in recording.tables.items() if name != "odometry"}
-    from dataclasses import replace
-
     with pytest.raises(ValueError, match=r"odometry\.csv"):
         gather(replace(recording, tables=tables))

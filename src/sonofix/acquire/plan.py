@@ -15,7 +15,7 @@ from sonofix.acquire.bank import Bank, make_bank
 from sonofix.acquire.baseband import Band, band_limited, design_band, downconvert
 from sonofix.acquire.epochs import missing_runs
 from sonofix.acquire.separate import Separation, Watch
-from sonofix.acquire.tones import MARGIN_S, find_tones, level_db
+from sonofix.acquire.tones import MARGIN_S, find_tones, level_db, told
 from sonofix.records import Detection, Prediction, Waveform
 
 
@@ -172,7 +172,6 @@ def taken_apart(
         )
         left = baseband - sum(tone.course for tone in tones)
         for tone in tones:
-            text = f"a tone at {(band.carrier_hz + tone.offset_hz) / 1e3:.3f} kHz"
-            job.notes.append(f"{text}, {level_db(tone, left):.0f} dB over all else in the band, was taken out")
+            job.notes.append(told(band.carrier_hz + tone.offset_hz, level_db(tone, left)))
         job.run(predictions or {}, everywhere)
         yield job

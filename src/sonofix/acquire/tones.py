@@ -7,6 +7,7 @@ straight line through the epoch, so that a drifting source leaves little behind.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,9 @@ STANDS_OUT = 100.0
 """A line this many times the median power of the spectrum is looked at."""
 
 MOST_TONES = 3
+
+TOLD = re.compile(r"a tone at (?P<khz>[\d.]+) kHz, (?P<db>\d+) dB (?P<way>over|below) all else in the band")
+"""What `told` writes."""
 
 Complexes = NDArray[np.complexfloating]
 
@@ -121,3 +125,10 @@ def level_db(tone: Tone, left: Floats | Complexes) -> float:
     """Power of a tone over that of what is left, dB."""
     power = float(np.mean(np.abs(tone.course) ** 2))
     return 10 * float(np.log10(max(power, 1e-30) / max(float(np.mean(np.abs(left) ** 2)), 1e-30)))
+
+
+def told(frequency_hz: float, level_db: float) -> str:
+    """Word a tone that was taken out."""
+    way = "below" if round(level_db) < 0 else "over"
+    level = f"{abs(level_db):.0f} dB {way} all else in the band"
+    return f"a tone at {frequency_hz / 1e3:.3f} kHz, {level}, was taken out"

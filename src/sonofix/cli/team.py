@@ -89,11 +89,11 @@ def _run(
 
     recording = files.read_recording(folder, to_run="bearings" not in _stems(folder))
     _check(recording, landmarks_of)
+    _check_clock(recording)
     truths = files.read_truth(folder)
     kept: list[Step] = []
     moments: list[Moment] = []
     means: list[Floats] = []
-    notes: list[str] = []
     try:
         with progress_bar() as bar:
             feed, receiver = _feed(recording, bar)
@@ -107,7 +107,7 @@ def _run(
                 from sonofix.team.apart import follow_apart
                 from sonofix.team.fleet import follow
 
-                belief = apart = None
+                behind = None
                 found = follow_apart(feed) if decentralised else follow(feed, odometry_alone)
                 for moment, behind in found:
                     moments.append(moment)
@@ -116,10 +116,7 @@ def _run(
                     bar.advance(task)
                     stop_if_asked()
                     yield moment
-                    apart = behind if decentralised else None
-                    belief = None if decentralised else behind
-                notes.extend(_told(feed, belief, apart))
-                last.append(belief)
+                last.append(behind)
 
             last: list = []
 
@@ -148,14 +145,18 @@ def _run(
     picture = out / "team.png"
     picture.unlink(missing_ok=True)
     _summarise(folder, out, feed, moments, kept, scored=bool(truths), smoothed=smooth)
-    for note in notes:
-        speaker().print(note)
+    if decentralised and last and last[0] is not None:
+        from sonofix.team.message import BYTES
+
+        speaker().print(f"{last[0].told} messages of {BYTES} bytes")
     if plot:
         with drawing():
             from sonofix.draw.team import draw_team
 
             draw_team(recording, kept, truths).savefig(picture)
-    if animate is not None:
+    if animate is not None and not any(step.estimates for step in kept):
+        speaker().print("No animation: no robot was placed")
+    elif animate is not None:
         with drawing():
             from sonofix.draw.team_film import write_film
             from sonofix.files.writing import write_whole
@@ -184,6 +185,21 @@ def _check(recording: Recording, landmarks_of: list[str] | None) -> None:
             raise ValueError(f"--landmarks-of {name}: no vehicle of the site; it has {', '.join(ids)}")
 
 
+def _check_clock(recording: Recording) -> None:
+    """Raise ValueError where ranges hold an unknown offset, which robots' filters have no state for."""
+    site = recording.site
+    if site.clock_known or (recording.blocks is None and recording.ranges is None):
+        return
+    free = site.schedule is not None and not site.schedule.synchronised
+    field = "schedule.synchronised = false" if free else "beacon.code.distance_m is not stated"
+    made = "those of samples" if recording.blocks is not None else "ranges.csv"
+    raise ValueError(
+        f"site.toml: {field}, so ranges ({made}) are known but for an offset, and a team needs whole ones; "
+        + ("set it to true where no offset is left, give exchanges.csv alone, " if free else "state it, ")
+        + "let robots range each other two-way (own_clocks = true), or run it with: sonofix run"
+    )
+
+
 def _feed(recording: Recording, bar: Progress) -> tuple[Feed, Listened | None]:
     """Gather what the receiver makes of a recording's samples, or what it states: ranges, or else exchanges."""
     from sonofix import flow
@@ -199,15 +215,6 @@ def _feed(recording: Recording, bar: Progress) -> tuple[Feed, Listened | None]:
         return gather(recording), None
     epochs = list(exchange_epochs(recording.tables["exchanges"], recording.site))
     return gather(recording, ranges_of(epochs), own_ranges=all(epoch.sd_stated for epoch in epochs)), None
-
-
-def _told(feed: Feed, belief, apart) -> list[str]:
-    """Return lines on what was learnt on the way."""
-    if apart is not None:
-        from sonofix.team.message import BYTES
-
-        return [f"{apart.told} messages of {BYTES} bytes"]
-    return []
 
 
 def _summarise(

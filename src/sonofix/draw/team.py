@@ -39,12 +39,17 @@ def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, 
     Returns
     -------
     Figure
-        16 × 10 inches, on an Agg canvas.
+        16 × 10 inches, on an Agg canvas; where no robot was placed it says so.
     """
     truths = truths or {}
     tracks = tracks_of(recording, steps)
     colours = dict(zip(tracks, style.category_colours(len(tracks)), strict=True))
     with style.sheet() as figure:
+        title = recording.site.name or "team"
+        figure.text(0.05, 0.948, title, fontsize=26, fontweight="bold", color=style.INK, va="center")
+        if not tracks:
+            figure.text(0.5, 0.5, "no robot was placed", fontsize=20, color=style.MUTED, ha="center", va="center")
+            return figure
         plan = figure.add_axes((0.05, 0.08, 0.54, 0.80))
         draw_landmarks(plan, recording)
         for name, track in tracks.items():
@@ -61,15 +66,12 @@ def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, 
         style.dress(plan, "Tracks", "ellipses: three deviations" + ("; fine: truth" if truths else ""))
         plan.set_xlabel("x (m)")
         plan.set_ylabel("y (m)")
-        if tracks:
-            plan.legend(loc="upper right", fontsize=10)
+        plan.legend(loc="upper right", fontsize=10)
         error = figure.add_axes((0.66, 0.50, 0.32, 0.38))
         _draw_doubt(error, tracks, truths, colours)
         roles = figure.add_axes((0.66, 0.08, 0.32, 0.33), sharex=error)
         _draw_roles(roles, recording, steps, tracks, colours)
         roles.set_xlabel("time (s)")
-        title = recording.site.name or "team"
-        figure.text(0.05, 0.948, title, fontsize=26, fontweight="bold", color=style.INK, va="center")
     return figure
 
 

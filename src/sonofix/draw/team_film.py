@@ -21,8 +21,8 @@ LEAST_S = 0.5
 
 FRAME_MS = 80
 
-TAIL_S = 0.08
-"""Share of the recording that each track's tail shows."""
+TAIL_SHARE = 0.08
+"""Of the recording, that each track's tail shows."""
 
 
 def write_film(
@@ -58,7 +58,7 @@ def write_film(
                 last = int(np.searchsorted(times[name], now, side="right")) - 1
                 if last < 0 or now - times[name][last] > 5.0:
                     continue
-                first = int(np.searchsorted(times[name], now - TAIL_S * (end - begin)))
+                first = int(np.searchsorted(times[name], now - TAIL_SHARE * (end - begin)))
                 axes.plot(*places(track[first : last + 1]).T, color=colours[name], linewidth=1.0, alpha=0.6)
                 axes.add_patch(ellipse(track[last], colours[name]))
                 x, y = track[last].position_m[:2]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sonofix.ranging import pair_biases
 from sonofix.records import Floats, RangeRows, Recording, Table
 from sonofix.site import Site
 from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
@@ -76,11 +77,6 @@ class Feed:
     starts: dict[int, tuple[float, float, float]]
 
     @property
-    def pairs(self) -> int:
-        """How many pairs of ends there are."""
-        return int(self.pair.max()) + 1 if len(self.pair) else 0
-
-    @property
     def views(self) -> int:
         """How many views there are."""
         return int(self.view.max()) + 1 if len(self.view) else 0
@@ -113,14 +109,14 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
     ----------
     recording : Recording
     ranges : RangeRows or None
-        In place of the recording's own, which it may lack.
+        In place of the recording's own, which it may lack; what the site states of pairs' biases is off already.
     own_ranges : bool
         See `Feed`.
 
     Raises
     ------
     ValueError
-        If no robot has odometry, or nothing was heard.
+        If no robot has odometry, nothing was heard, or all of one was before all of the other.
     """
     site = recording.site
     robots = tuple(vehicle.id for vehicle in site.vehicles)
@@ -130,9 +126,11 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
     first, odometry_s, odometry = _odometry(recording.tables.get("odometry"), robots, frozenset(headed))
     if not len(odometry_s):
         raise ValueError("odometry.csv: a team is carried by the odometry of its robots, and there is none")
-    rows = _sightings(ranges if ranges is not None else recording.ranges, recording.tables.get("bearings"))
+    heard = ranges if ranges is not None or recording.ranges is None else _unbiased(recording.ranges, site)
+    rows = _sightings(heard, recording.tables.get("bearings"))
     if not rows:
         raise ValueError("ranges.csv, bearings.csv: neither has a row, so no robot can be placed")
+    _check_times(recording, ranges is not None, odometry_s, np.array([row[0] for row in rows]))
     if compass is not None:
         whose = compass.names.get("vehicle") or (robots[0],) * len(compass.columns["time_s"])
         told = compass.columns
@@ -186,6 +184,31 @@ def heard_by(feed: Feed, landmarks_of: Iterable[str] | None = None, peers: bool 
     if not peers:
         keep &= fixed | (feed.kind == COMPASS)
     return feed.keep(keep)
+
+
+def _unbiased(rows: RangeRows, site: Site) -> RangeRows:
+    """Take off stated ranges what the site states of their pairs' biases; where it doubts these, so do deviations.
+
+    A deviation that nobody stated is judged by what ranges show: what remains is how far the bias is known.
+    """
+    bias_m, bias_sd_m = pair_biases(site, rows.emitter, rows.receiver)
+    sd_m = np.full(len(rows.time_s), np.nan) if rows.sd_m is None else rows.sd_m
+    sd_m = np.where(bias_sd_m > 0, np.hypot(np.nan_to_num(sd_m, nan=0.0), bias_sd_m), sd_m)
+    return replace(rows, range_m=rows.range_m - bias_m, sd_m=sd_m)
+
+
+def _check_times(recording: Recording, made: bool, odometry_s: Floats, heard_s: Floats) -> None:
+    """Raise ValueError where odometry and what is heard have no time in common; ``made``: ranges are no file's."""
+    if odometry_s.min() <= heard_s.max() and odometry_s.max() >= heard_s.min():
+        return
+    names = ["the capture" if recording.blocks is not None else "exchanges.csv"] if made else []
+    names += ["ranges.csv"] if not made and recording.ranges is not None else []
+    names += ["bearings.csv"] if "bearings" in recording.tables else []
+    raise ValueError(
+        f"odometry.csv (time_s from {odometry_s.min():.9g} to {odometry_s.max():.9g} s) tells nothing of the time of "
+        f"what is heard ({', '.join(names)}: from {heard_s.min():.9g} to {heard_s.max():.9g} s); "
+        "bring both to one clock"
+    )
 
 
 def _odometry(

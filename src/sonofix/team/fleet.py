@@ -79,23 +79,35 @@ class Moment:
 
 
 def instants(feed: Feed) -> list[tuple[float, int, int]]:
-    """Return the instants of a feed with their rows (first, last); empty ones fill silences of `FILL_S`."""
+    """Return the instants of a feed with their rows (first, last); empty ones fill silences of `FILL_S`.
+
+    Where no odometry comes either, they end once all have left, and begin again as long before something comes.
+    """
     changes = np.flatnonzero(np.diff(feed.time_s) > 0) + 1
     edges = [0, *changes.tolist(), len(feed.time_s)] if len(feed.time_s) else [0]
     begin, end = float(feed.odometry_s.min()), float(feed.odometry_s.max())
     out: list[tuple[float, int, int]] = []
+    told_s = np.sort(feed.odometry_s)
     last = min(begin, float(feed.time_s[0])) if len(feed.time_s) else begin
     for a, b in pairwise(edges):
         time = float(feed.time_s[a])
-        out += [(t, a, a) for t in _between(last, time)]
+        out += [(t, a, a) for t in _between(last, time, told_s)]
         out.append((time, a, b))
         last = time
-    return out + [(t, len(feed.time_s), len(feed.time_s)) for t in _between(last, end + 1e-9)]
+    return out + [(t, len(feed.time_s), len(feed.time_s)) for t in _between(last, end + 1e-9, told_s)]
 
 
-def _between(after_s: float, before_s: float) -> list[float]:
+def _between(after_s: float, before_s: float, told_s: Floats) -> list[float]:
+    """Return instants between two, but none far from both and from those at which odometry told something."""
     count = int(np.ceil((before_s - after_s) / FILL_S)) - 1
-    return [after_s + FILL_S * (i + 1) for i in range(count)]
+    between = told_s[np.searchsorted(told_s, after_s) : np.searchsorted(told_s, before_s)]
+    near = np.concatenate([[after_s], between, [before_s]])
+    # who leaves is told at the second instant after that at the latest
+    reach_s = LEFT_S + 2 * FILL_S
+    gaps = np.flatnonzero(np.diff(near) > 2 * reach_s)
+    first = [1, *np.ceil((near[gaps + 1] - reach_s - after_s) / FILL_S).astype(int).tolist()]
+    last = [*np.floor((near[gaps] + reach_s - after_s) / FILL_S).astype(int).tolist(), count]
+    return [after_s + FILL_S * i for a, b in zip(first, last, strict=True) for i in range(max(a, 1), min(b, count) + 1)]
 
 
 @dataclass(eq=False, slots=True)
@@ -332,10 +344,16 @@ def _place(belief: Belief, feed: Feed, recent: Recent, time_s: float, events: li
 
 
 def _odd(feed: Feed, odds: Odds, time_s: float) -> list[Event]:
-    text = "its ranges with {} are off by {:.2f} m, while all else agrees: one of them is elsewhere"
+    if odds.refused:
+        whose = " and ".join(feed.robots[robot] for robot in odds.refused)
+        why = f"and most of what else is heard of {whose} is refused: are start poses right, and ranges in metres?"
+    elif odds.alone:
+        why = "and little else is heard of them: one of them is elsewhere"
+    else:
+        why = "while all else agrees: one of them is elsewhere"
     names = [feed.robots[robot] for robot in odds.robots]
     return [
-        Event(time_s, name, "excluded", text.format(other, odds.miss_m))
+        Event(time_s, name, "excluded", f"its ranges with {other} are off by {odds.miss_m:.2f} m, {why}")
         for name, other in zip(names, names[::-1], strict=True)
     ]
 

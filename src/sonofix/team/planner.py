@@ -85,8 +85,6 @@ class Plan:
         Of the strip: how far along the course each robot goes at a time in the long run, and its width.
     leaps : int
         To the end of the course, this one included.
-    driven_m : float
-        By all robots together.
     end_sd_m : float
         √(σx² + σy²) of the robot that arrives.
     """
@@ -98,7 +96,6 @@ class Plan:
     step_m: float
     width_m: float
     leaps: int
-    driven_m: float
     end_sd_m: float
 
 
@@ -206,20 +203,14 @@ def plan(
         if found is None or not np.isfinite(found[1][-1].covariance).all():
             continue
         leaps, known = found
-        ways = [
-            float(np.hypot(*(place - before.place_m[before.index(robot)])))
-            for (robot, place), before in zip(leaps, [formation, *known], strict=False)
-        ]
         end_sd = known[-1].sd_m(leaps[-1][0])
-        tried.append(Plan("ok", "", *leaps[0], step_m, width_m, len(leaps), sum(ways), end_sd))
+        tried.append(Plan("ok", "", *leaps[0], step_m, width_m, len(leaps), end_sd))
     if not tried:
         text = f"every strip takes robots beyond {ranging.reach_m:g} m of each other: bring them nearer together"
-        return Plan("unreachable", text, "", np.full(2, np.nan), np.nan, np.nan, 0, np.nan, np.nan)
+        return Plan("unreachable", text, "", np.full(2, np.nan), np.nan, np.nan, 0, np.nan)
     enough = [p for p in tried if p.end_sd_m <= wanted_sd_m]
     if enough:
         return min(enough, key=lambda p: (p.leaps, p.end_sd_m))
     best = min(tried, key=lambda p: p.end_sd_m)
     text = f"no plan ends within {wanted_sd_m:.3g} m: range longer at each stop, or know the speed of sound better"
-    return Plan(
-        "beyond", text, best.robot, best.place_m, best.step_m, best.width_m, best.leaps, best.driven_m, best.end_sd_m
-    )
+    return Plan("beyond", text, best.robot, best.place_m, best.step_m, best.width_m, best.leaps, best.end_sd_m)

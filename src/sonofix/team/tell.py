@@ -8,10 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sonofix.acquire import tones
 from sonofix.ranging import RANGES_WITHOUT_SD_M
 from sonofix.records import Estimate, Event, Floats, RangeEpoch, RangeRows, Source, Step
 from sonofix.team.feed import Feed
 from sonofix.team.fleet import Moment, instants
+
+CHANGED_DB = 3.0
+"""By so much a tone's level must change to be told of again."""
+
+ALIKE_HZ = 50.0
+"""Tones of one microphone, from epoch to epoch, that are no further apart are one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,7 +30,8 @@ class Listened:
     shown : mapping from (time_s, emitter, receiver) to (3,)
         Of a range: range rate and its deviation (m/s), and the signal to noise ratio (dB); NaN where not told.
     events : tuple of Event
-        Of samples (clipped, missing, a tone) and what could be made of them, in order of time.
+        Of samples (clipped, missing; a tone that begins, ends or changes by `CHANGED_DB`) and what could be made of
+        them, in order of time.
     """
 
     shown: Mapping[tuple[float, str, str], Floats]
@@ -34,6 +42,7 @@ def listened(steps: Iterable[Step]) -> Listened:
     """Return what a receiver's steps tell besides ranges; what they tell of vehicles is of another track."""
     shown: dict[tuple[float, str, str], Floats] = {}
     events: list[Event] = []
+    sounding: list[_Tone] = []
     for step in steps:
         epoch = step.ranges
         untold = np.full(len(epoch), np.nan)
@@ -41,8 +50,39 @@ def listened(steps: Iterable[Step]) -> Listened:
         told = np.column_stack([untold if column is None else column for column in columns])
         ends = zip(epoch.time_s.tolist(), epoch.emitter, epoch.receiver, strict=True)
         shown.update(zip(ends, told, strict=True))
-        events += [event for event in step.events if not event.vehicle]
+        new, sounding = _news([event for event in step.events if not event.vehicle], sounding, epoch.sync_s)
+        events += new
     return Listened(shown, tuple(sorted(events, key=lambda event: event.time_s)))
+
+
+_Tone = tuple[str, float, float]
+"""Who hears it, its frequency in Hz, and its level in dB as last told."""
+
+
+def _news(events: Sequence[Event], before: Sequence[_Tone], time_s: float) -> tuple[list[Event], list[_Tone]]:
+    """Return an epoch's events without tones that go on as told ``before``, with those that ended, and its tones."""
+    news: list[Event] = []
+    now: list[_Tone] = []
+    left = list(before)
+    for event in events:
+        found = tones.TOLD.search(event.detail)
+        if found is None:
+            news.append(event)
+            continue
+        who, hz = event.detail[: found.start()], 1e3 * float(found["khz"])
+        level_db = float(found["db"]) * (1.0 if found["way"] == "over" else -1.0)
+        same = min((t for t in left if t[0] == who), key=lambda t: abs(t[1] - hz), default=None)
+        if same is None or abs(same[1] - hz) > ALIKE_HZ:
+            told_db = np.inf
+        else:
+            left.remove(same)
+            told_db = same[2]
+        if abs(level_db - told_db) >= CHANGED_DB:
+            news.append(event)
+            told_db = level_db
+        now.append((who, hz, told_db))
+    ended = [Event(time_s, "", "samples", f"{who}the tone at {hz / 1e3:.3f} kHz has ended") for who, hz, _ in left]
+    return news + ended, now
 
 
 def ranges_of(epochs: Iterable[RangeEpoch]) -> RangeRows:

@@ -28,6 +28,7 @@ AT_ODDS = 8
 class Odds:
     """Two robots whose ranges contradict where both are, since they last agreed (−∞: they never did), and by how much.
 
+    ``refused``: those of them of which most else that is heard is refused too; ``alone``: nothing else is.
     Nothing tells which of them is elsewhere, nor by what it was turned round the others: ``variance_m2`` allows for
     twice as much, either way.
     """
@@ -35,6 +36,8 @@ class Odds:
     robots: tuple[int, int]
     agreed_s: float
     miss_m: float
+    refused: tuple[int, ...] = ()
+    alone: bool = False
 
     @property
     def variance_m2(self) -> float:
@@ -108,7 +111,17 @@ class Watch:
     def at_odds(self) -> tuple[Odds, ...]:
         """Return pairs of robots whose ranges are refused again and again."""
         return tuple(
-            Odds(pair, self._agreed_s.get(pair, -np.inf), float(np.median(misses[-AT_ODDS:])))
+            self._odd(pair, float(np.median(misses[-AT_ODDS:])))
             for pair, misses in self._odds.items()
             if len(misses) >= AT_ODDS
         )
+
+    def _odd(self, pair: tuple[int, int], miss_m: float) -> Odds:
+        """Return two robots that contradict each other, with what became of what else was heard of them latest."""
+        else_taken = [
+            [taken for _, partner, _, taken in self._latest[robot] if partner != other]
+            for robot, other in (pair, pair[::-1])
+        ]
+        refused = [robot for robot, taken in zip(pair, else_taken, strict=True) if 2 * sum(taken) < len(taken)]
+        agreed_s = self._agreed_s.get(pair, -np.inf)
+        return Odds(pair, agreed_s, miss_m, tuple(refused), not all(else_taken))
