@@ -52,6 +52,9 @@ class Feed:
         Ranges are this receiver's own, whose deviations are to be believed.
     sound_speed_mps : float
     starts : mapping from robot index to (x, y, yaw)
+    scale_sd : float
+        Deviation of the share by which all own ranges may be too long at once, as the sound speed is off;
+        ``range_sd_m`` does not hold it.
     """
 
     robots: tuple[str, ...]
@@ -74,6 +77,7 @@ class Feed:
     own_ranges: bool
     sound_speed_mps: float
     starts: dict[int, tuple[float, float, float]]
+    scale_sd: float = 0.0
 
     @property
     def pairs(self) -> int:
@@ -170,6 +174,7 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
         own_ranges=own_ranges,
         sound_speed_mps=site.sound_speed_mps,
         starts=_starts(recording.tables.get("start"), robots),
+        scale_sd=ranges.speed_sd_mps / site.sound_speed_mps if own_ranges and ranges is not None else 0.0,
     )
 
 

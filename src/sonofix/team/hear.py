@@ -120,7 +120,9 @@ def hear(
         for turn in range(TURNS):
             if turn > 0:
                 point[:], mean[:], covariance[:, :] = mean, before, doubt
-            shown, direction, _ = expect(point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            shown, direction, _ = expect(
+                point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, believed, row
+            )
             if own_error >= 0:
                 row[0, own_error] = stays
                 shown += stays * point[own_error]
