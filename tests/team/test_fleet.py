@@ -397,20 +397,20 @@ def in_sound(recording, truth, off, fixed):
     rng = np.random.default_rng(0)
     places = {b.id: np.array(b.position_m[:2]) for b in site.beacons if b.vehicle is None}
     rows = []
+
+    def at(name, t, since_s=0.0):
+        rows = truth.get(name)
+        if rows is None:
+            return places[name]
+        x, y, yaw = (np.interp(t, rows[:, 0], rows[:, i]) for i in (1, 2, 3))
+        return x - 0.4 * since_s * np.cos(yaw), y - 0.4 * since_s * np.sin(yaw)
+
     for t, emitter, receiver in zip(told.time_s.tolist(), told.emitter, told.receiver, strict=True):
-
-        def at(name, since_s=0.0):
-            rows = truth.get(name)
-            if rows is None:
-                return places[name]
-            x, y, yaw = (np.interp(t, rows[:, 0], rows[:, i]) for i in (1, 2, 3))
-            return x - 0.4 * since_s * np.cos(yaw), y - 0.4 * since_s * np.sin(yaw)
-
         if fixed == "hear" and emitter in places:
             emitter, receiver = receiver, emitter
         # sent while the way there took it, at 0.4 m/s a millimetre a metre
-        way = np.hypot(*np.subtract(at(emitter), at(receiver)))
-        way = np.hypot(*np.subtract(at(emitter, way / site.sound_speed_mps), at(receiver)))
+        way = np.hypot(*np.subtract(at(emitter, t), at(receiver, t)))
+        way = np.hypot(*np.subtract(at(emitter, t, way / site.sound_speed_mps), at(receiver, t)))
         rows.append((t, emitter, receiver, (1 + off) * way + rng.normal(0, 1e-3)))
     if fixed == "hear":
         landmarks = [b for b in site.beacons if b.vehicle is None]

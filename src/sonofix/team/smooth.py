@@ -260,7 +260,8 @@ def _pass(
         ends[k + 1] = _hear(
             mean, covariance, nominal[k], active[k], moment.rows, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.bearing_rad, feed.view, errors, weights,
-            judged is None, 1.0 / feed.sound_speed_mps, speed, feed.own_ranges, used, kept, gains, totals, misses, int(ends[k]), work,
+            judged is None, 1.0 / feed.sound_speed_mps, speed, feed.own_ranges, used, kept, gains, totals, misses,
+            int(ends[k]), work,
         )  # fmt: skip
         means[k], covariances[k] = mean, covariance
         on_moment()
