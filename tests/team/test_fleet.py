@@ -439,3 +439,37 @@ def test_what_a_receiver_makes_of_samples_keeps_what_ranges_share_apart():
     assert rows.sd_m is not None
     np.testing.assert_allclose(rows.sd_m, sd_m, rtol=1e-6)
     assert rows.speed_sd_mps == pytest.approx(SHARE_SD * c)
+
+
+def with_starts(recording, truth, sd_m):
+    """Return a recording of ranges alone that state a deviation, with start poses."""
+    starts = np.array([rows[0, 1:] for rows in truth.values()]).T
+    table = Table(dict(zip(("x_m", "y_m", "yaw_rad"), starts, strict=True)), {"vehicle": tuple(truth)})
+    told = recording.ranges
+    ranges = replace(told, sd_m=np.full(len(told.time_s), sd_m))
+    return replace(recording, ranges=ranges, tables={"odometry": recording.tables["odometry"], "start": table})
+
+
+def test_ranges_that_state_how_good_they_are_tell_as_much_as_ones_own():
+    ratios, squares = [], []
+    for seed in range(4):
+        recording, truth = fleet(seconds=30, seed=600 + seed)
+        recording = with_starts(recording, truth, 0.05)
+        stated = errors([m for m, _ in follow(gather(recording))], truth, after_s=5)
+        own = errors([m for m, _ in follow(gather(recording, own_ranges=True))], truth, after_s=5)
+        ratios.append(nees(*stated))
+        squares.append([np.mean(stated[0] ** 2), np.mean(own[0] ** 2)])
+    assert 0.5 < np.mean(ratios) < 4.0
+    stated, own = np.mean(squares, axis=0)
+    assert stated < 1.3**2 * own
+
+
+def test_ranges_that_state_too_much_of_themselves_are_found_out():
+    ratios = []
+    for seed in range(4):
+        recording, truth = fleet(seconds=40, seed=620 + seed, staying_m=0.2)
+        recording = with_starts(recording, truth, 0.05)
+        found = (follow(gather(recording, own_ranges=own)) for own in (False, True))
+        ratios.append([nees(*errors([m for m, _ in one], truth, after_s=20)) for one in found])
+    # 2 where deviations are right; by 4 stated deviations off, ranges are believed by far less than they ask for
+    assert np.mean(ratios, axis=0)[0] < 8.0 < 30.0 < np.mean(ratios, axis=0)[1]

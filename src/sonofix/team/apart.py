@@ -60,7 +60,8 @@ class Apart:
             scales = np.arange(SCALE, SIZE * len(feed.robots), SIZE)
             self.belief.covariance[np.ix_(scales, scales)] = np.diag(np.full(len(scales), feed.scale_sd**2))
             self.dependent[scales, scales] = feed.scale_sd**2
-        self._noise: list[Noise] = [noise(len(feed.robots), feed.views, feed.own_ranges) for _ in feed.robots]
+        told = len(feed.robots), feed.views, feed.own_ranges, feed.stated_sd_m
+        self._noise: list[Noise] = [noise(*told) for _ in feed.robots]
         self.rough = Rough(feed)
         robots = len(feed.robots)
         owner = np.full(0 if feed.own_ranges else feed.views, -1)

@@ -89,6 +89,12 @@ class Feed:
         """How many views there are."""
         return int(self.view.max()) + 1 if len(self.view) else 0
 
+    @property
+    def stated_sd_m(self) -> float:
+        """The median deviation that ranges state; NaN where one of them states none."""
+        sd_m = self.range_sd_m[np.isfinite(self.range_m)]
+        return float(np.median(sd_m)) if len(sd_m) and np.isfinite(sd_m).all() else np.nan
+
     def keep(self, rows: NDArray[np.bool_]) -> Feed:
         """Return the feed with some of its rows alone."""
         cut = {

@@ -141,7 +141,7 @@ class Belief:
             np.concatenate([np.zeros(SIZE * robots), np.zeros(views)]),
             covariance,
             np.zeros(robots, bool),
-            noise(robots, feed.views, feed.own_ranges),
+            noise(robots, feed.views, feed.own_ranges, feed.stated_sd_m),
             np.zeros(robots),
             np.ones((robots, 4)),
             np.full((views, 2), np.nan),
