@@ -12,7 +12,8 @@ from sonofix.team.fleet import follow, instants
 from sonofix.team.message import BYTES, TOLD, Message, unpack
 from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth
-from sonofix.team.tell import listened, steps_of
+from sonofix.team.state import SCALE, SIZE
+from sonofix.team.tell import listened, ranges_of, steps_of
 from team.made_fleet import errors, fleet, nees
 
 
@@ -453,3 +454,120 @@ def test_a_recording_without_odometry_says_so():
     tables = {name: table for name, table in recording.tables.items() if name != "odometry"}
     with pytest.raises(ValueError, match=r"odometry\.csv"):
         gather(replace(recording, tables=tables))
+
+
+SHARE_SD = 0.0018
+"""Of a sound speed that rests on a thermometer: 1 K is 0.6 m/s."""
+
+
+@pytest.mark.parametrize("fixed", ["heard", "hear"])
+def test_a_sound_speed_that_is_off_is_one_error_of_all_ranges_and_is_found_out(fixed):
+    ratios, apart, spared = [], [], []
+    for seed, off in ((500, SHARE_SD), (501, -SHARE_SD)):
+        recording, truth = fleet(seconds=20, seed=seed)
+        recording = in_sound(recording, truth, off, fixed)
+        feed = gather(recording, recording.ranges, own_ranges=True)
+        assert feed.scale_sd == pytest.approx(SHARE_SD)
+        moments, means, belief = [], [], None
+        for moment, belief in follow(feed):
+            moments.append(moment)
+            means.append(belief.mean.copy())
+        assert belief is not None
+        scale = belief.mean[SCALE : SIZE * 3 : SIZE]
+        # one number; a range of 1 mm over 3 m tells it to 3e-4, and there are hundreds
+        np.testing.assert_allclose(scale, scale[0], rtol=1e-6)
+        assert abs(scale[0] - off) < 4 * np.sqrt(belief.covariance[SCALE, SCALE]) < SHARE_SD / 6
+        ratios.append(nees(*errors(moments, truth, after_s=5)))
+        ratios.append(nees(*errors(smooth(feed, moments, belief, np.array(means)), truth, after_s=5)))
+        apart.append(nees(*errors([moment for moment, _ in follow_apart(feed)], truth, after_s=5)))
+        taken = [m for m, _ in follow(replace(feed, scale_sd=0.0))]
+        spared.append(nees(*errors(taken, truth, after_s=5)))
+    # 2 where deviations are right; errors of a run are alike over seconds, so two of three robots tell it to a third
+    assert 1.0 < np.mean(ratios) < 3.0
+    assert np.mean(apart) < 3.0
+    # taken as it is, it makes of a millimetre's noise errors of several
+    assert np.mean(spared) > 8.0
+
+
+def in_sound(recording, truth, off, fixed):
+    """Return the recording with ranges of 1 mm by a sound speed that is ``off``, landmarks heard or hearing."""
+    site, told = recording.site, recording.ranges
+    rng = np.random.default_rng(0)
+    places = {b.id: np.array(b.position_m[:2]) for b in site.beacons if b.vehicle is None}
+    rows = []
+
+    def at(name, t, since_s=0.0):
+        rows = truth.get(name)
+        if rows is None:
+            return places[name]
+        x, y, yaw = (np.interp(t, rows[:, 0], rows[:, i]) for i in (1, 2, 3))
+        return x - 0.4 * since_s * np.cos(yaw), y - 0.4 * since_s * np.sin(yaw)
+
+    for t, emitter, receiver in zip(told.time_s.tolist(), told.emitter, told.receiver, strict=True):
+        if fixed == "hear" and emitter in places:
+            emitter, receiver = receiver, emitter
+        # sent while the way there took it, at 0.4 m/s a millimetre a metre
+        way = np.hypot(*np.subtract(at(emitter, t), at(receiver, t)))
+        way = np.hypot(*np.subtract(at(emitter, t, way / site.sound_speed_mps), at(receiver, t)))
+        rows.append((t, emitter, receiver, (1 + off) * way + rng.normal(0, 1e-3)))
+    if fixed == "hear":
+        landmarks = [b for b in site.beacons if b.vehicle is None]
+        site = site.model_dump(mode="json", exclude_none=True, by_alias=True)
+        site["microphone"] += [{"id": b.id, "position_m": list(b.position_m)} for b in landmarks]
+        site["beacon"] = [b for b in site["beacon"] if b["id"] not in places]
+        site = Site.model_validate(site)
+    time_s, emitter, receiver, range_m = zip(*rows, strict=True)
+    told = np.array(time_s), emitter, receiver, np.array(range_m), np.full(len(rows), 1e-3)
+    ranges = RangeRows(*told, speed_sd_mps=SHARE_SD * site.sound_speed_mps)
+    odometry = {"odometry": recording.tables["odometry"]}
+    starts = np.array([rows[0, 1:] for rows in truth.values()]).T
+    odometry["start"] = Table(dict(zip(("x_m", "y_m", "yaw_rad"), starts, strict=True)), {"vehicle": tuple(truth)})
+    return Recording(site, ranges=ranges, tables=odometry)
+
+
+def test_what_a_receiver_makes_of_samples_keeps_what_ranges_share_apart():
+    range_m, sd_m, c = np.array([1.0, 4.0]), np.array([1e-3, 2e-3]), 343.0
+    shared = np.outer(range_m, range_m) * SHARE_SD**2
+    epoch = RangeEpoch(
+        index=0, sync_s=0.0, emitter=("A", "B"), receiver=("M", "M"), time_s=np.zeros(2), range_m=range_m,
+        covariance_m2=np.diag(sd_m**2) + shared, range_rate_mps=None, range_rate_sd_mps=None, snr_db=None,
+        clock="known", sound_speed_mps=c, sound_speed_sd_mps=SHARE_SD * c,
+    )  # fmt: skip
+    rows = ranges_of([epoch])
+    assert rows.sd_m is not None
+    np.testing.assert_allclose(rows.sd_m, sd_m, rtol=1e-6)
+    assert rows.speed_sd_mps == pytest.approx(SHARE_SD * c)
+
+
+def with_starts(recording, truth, sd_m):
+    """Return a recording of ranges alone that state a deviation, with start poses."""
+    starts = np.array([rows[0, 1:] for rows in truth.values()]).T
+    table = Table(dict(zip(("x_m", "y_m", "yaw_rad"), starts, strict=True)), {"vehicle": tuple(truth)})
+    told = recording.ranges
+    ranges = replace(told, sd_m=np.full(len(told.time_s), sd_m))
+    return replace(recording, ranges=ranges, tables={"odometry": recording.tables["odometry"], "start": table})
+
+
+def test_ranges_that_state_how_good_they_are_tell_as_much_as_ones_own():
+    ratios, squares = [], []
+    for seed in range(4):
+        recording, truth = fleet(seconds=30, seed=600 + seed)
+        recording = with_starts(recording, truth, 0.05)
+        stated = errors([m for m, _ in follow(gather(recording))], truth, after_s=5)
+        own = errors([m for m, _ in follow(gather(recording, own_ranges=True))], truth, after_s=5)
+        ratios.append(nees(*stated))
+        squares.append([np.mean(stated[0] ** 2), np.mean(own[0] ** 2)])
+    assert 0.5 < np.mean(ratios) < 4.0
+    stated, own = np.mean(squares, axis=0)
+    assert stated < 1.3**2 * own
+
+
+def test_ranges_that_state_too_much_of_themselves_are_found_out():
+    ratios = []
+    for seed in range(4):
+        recording, truth = fleet(seconds=40, seed=620 + seed, staying_m=0.2)
+        recording = with_starts(recording, truth, 0.05)
+        found = (follow(gather(recording, own_ranges=own)) for own in (False, True))
+        ratios.append([nees(*errors([m for m, _ in one], truth, after_s=20)) for one in found])
+    # 2 where deviations are right; by 4 stated deviations off, ranges are believed by far less than they ask for
+    assert np.mean(ratios, axis=0)[0] < 8.0 < 30.0 < np.mean(ratios, axis=0)[1]

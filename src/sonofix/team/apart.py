@@ -27,7 +27,7 @@ from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, noise, varian
 from sonofix.team.placing import Placed, place
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
-from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, X, Y
+from sonofix.team.state import POSE, SCALE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, X, Y
 from sonofix.team.watch import Watch
 
 EVERY_S = 1.0
@@ -55,7 +55,13 @@ class Apart:
         self.feed = feed
         self.belief = Belief.blank(feed)
         self.dependent = np.zeros_like(self.belief.covariance)
-        self._noise: list[Noise] = [noise(len(feed.robots), feed.views, feed.own_ranges) for _ in feed.robots]
+        if feed.own_ranges:
+            # nobody sees that the others' ranges err by the same share, but all know that they may
+            scales = np.arange(SCALE, SIZE * len(feed.robots), SIZE)
+            self.belief.covariance[np.ix_(scales, scales)] = np.diag(np.full(len(scales), feed.scale_sd**2))
+            self.dependent[scales, scales] = feed.scale_sd**2
+        told = len(feed.robots), feed.views, feed.own_ranges, feed.stated_sd_m
+        self._noise: list[Noise] = [noise(*told) for _ in feed.robots]
         self.rough = Rough(feed)
         robots = len(feed.robots)
         owner = np.full(0 if feed.own_ranges else feed.views, -1)
@@ -191,8 +197,9 @@ class Apart:
         about[there + np.array(SENT)] = other.mean[: len(SENT)]
         speed[1] = self.belief.speed[feed.source[row]]
         shown, direction, _ = expect(
-            about, 0, 1, feed.listener_point[row], feed.source_point[row], 1.0 / feed.sound_speed_mps, speed, by
-        )
+            about, 0, 1, feed.listener_point[row], feed.source_point[row], 1.0 / feed.sound_speed_mps, speed,
+            feed.own_ranges, by,
+        )  # fmt: skip
         own = self._own[robot]
         rows, others = np.zeros((2, len(own))), np.zeros((2, TOLD))
         rows[:, :SIZE], others[:, : len(SENT)] = by[:, here : here + SIZE], by[:, there + np.array(SENT)]

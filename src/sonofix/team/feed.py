@@ -53,6 +53,9 @@ class Feed:
         Ranges are this receiver's own, whose deviations are to be believed.
     sound_speed_mps : float
     starts : mapping from robot index to (x, y, yaw)
+    scale_sd : float
+        Deviation of the share by which all own ranges may be too long at once, as the sound speed is off;
+        ``range_sd_m`` does not hold it.
     """
 
     robots: tuple[str, ...]
@@ -75,11 +78,18 @@ class Feed:
     own_ranges: bool
     sound_speed_mps: float
     starts: dict[int, tuple[float, float, float]]
+    scale_sd: float = 0.0
 
     @property
     def views(self) -> int:
         """How many views there are."""
         return int(self.view.max()) + 1 if len(self.view) else 0
+
+    @property
+    def stated_sd_m(self) -> float:
+        """The median deviation that ranges state; NaN where one of them states none."""
+        sd_m = self.range_sd_m[np.isfinite(self.range_m)]
+        return float(np.median(sd_m)) if len(sd_m) and np.isfinite(sd_m).all() else np.nan
 
     def keep(self, rows: NDArray[np.bool_]) -> Feed:
         """Return the feed with some of its rows alone."""
@@ -168,6 +178,7 @@ def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bo
         own_ranges=own_ranges,
         sound_speed_mps=site.sound_speed_mps,
         starts=_starts(recording.tables.get("start"), robots),
+        scale_sd=ranges.speed_sd_mps / site.sound_speed_mps if own_ranges and ranges is not None else 0.0,
     )
 
 

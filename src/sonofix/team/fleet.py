@@ -19,7 +19,7 @@ from sonofix.team.placing import Placed, place
 from sonofix.team.pushed import SLIPPED, Before, Push, search, still_s
 from sonofix.team.recent import Recent
 from sonofix.team.rough import Rough
-from sonofix.team.state import POSE, SIZE, prior_sd, wander_psd
+from sonofix.team.state import POSE, SIZE, prior, wander_psd
 from sonofix.team.watch import Odds, Watch
 
 START_SD = (0.05, 0.05, 0.1)
@@ -147,16 +147,13 @@ class Belief:
         """Return what is believed before anything was heard: nothing but how large errors may be."""
         robots = len(feed.robots)
         views = 0 if feed.own_ranges else feed.views
-        sd = np.concatenate([np.tile(prior_sd(feed.own_ranges), robots), np.ones(views)])
-        covariance = np.diag(sd**2)
-        for r in range(robots):
-            at = slice(SIZE * r, SIZE * r + POSE)
-            covariance[at, at] = 0.0
+        covariance = np.eye(SIZE * robots + views)
+        covariance[: SIZE * robots, : SIZE * robots] = prior(robots, feed.own_ranges, feed.scale_sd)
         return cls(
             np.concatenate([np.zeros(SIZE * robots), np.zeros(views)]),
             covariance,
             np.zeros(robots, bool),
-            noise(robots, feed.views, feed.own_ranges),
+            noise(robots, feed.views, feed.own_ranges, feed.stated_sd_m),
             np.zeros(robots),
             np.ones((robots, 4)),
             np.full((views, 2), np.nan),

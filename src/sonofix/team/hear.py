@@ -120,7 +120,9 @@ def hear(
         for turn in range(TURNS):
             if turn > 0:
                 point[:], mean[:], covariance[:, :] = mean, before, doubt
-            shown, direction, _ = expect(point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            shown, direction, _ = expect(
+                point, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, believed, row
+            )
             if own_error >= 0:
                 row[0, own_error] = stays
                 shown += stays * point[own_error]
@@ -172,7 +174,14 @@ def learn(
             continue
         who = listener[i] if listener[i] >= 0 else robots
         for j in range(2):
-            if not used[k, j] or (j == 0 and believed):
+            if j == 0 and believed:
+                continue
+            apart = used[k, 1] or not np.isfinite(told[k, 1, 0])
+            if j == 0 and not used[k, 0] and apart and np.isfinite(range_sd_m[i]) and np.isfinite(told[k, 0, 0]):
+                # worse than stated, as its direction is not wrong: so they open to what they are
+                for sort in (STAYING, NEW):
+                    take(known, who, sort, range_m[i], CLIPPED * variance_of(known, who, sort, range_m[i]), 1.0)
+            if not used[k, j]:
                 continue
             off, own, variance, taken = told[k, j, 0], told[k, j, 1], told[k, j, 2], told[k, j, 3]
             if not believed:

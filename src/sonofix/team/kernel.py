@@ -247,10 +247,10 @@ def end_of(about, robot, point, place, by):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def expect(about, listener, source, listener_point, source_point, flight_s_per_m, speed, rows):
+def expect(about, listener, source, listener_point, source_point, flight_s_per_m, speed, common, rows):
     """Return the range and bearing that a state makes a listener measure, and the way; write their derivatives.
 
-    Range (1 + k) r + c with r = |p_source(t − r/c) − p_listener(t)|; bearing atan2(Δy, Δx) − yaw + offset.
+    Range (1 + k) r + b with r = |p_source(t − r/c) − p_listener(t)|; bearing atan2(Δy, Δx) − yaw + offset.
 
     Parameters
     ----------
@@ -263,6 +263,8 @@ def expect(about, listener, source, listener_point, source_point, flight_s_per_m
         One over the speed of sound.
     speed : float64 (V,)
         How fast each robot drives.
+    common : bool
+        k and b are the same for all, so that what a fixed listener hears has them too; else they are the listener's.
     rows : float64 (2, n), out
     """
     here, there = np.empty(2), np.empty(2)
@@ -280,15 +282,18 @@ def expect(about, listener, source, listener_point, source_point, flight_s_per_m
     scale = 1.0
     shown = r
     direction = np.arctan2(dy, dx)
-    if listener >= 0:
-        at = SIZE * listener
+    whose = source if common and listener < 0 else listener
+    if whose >= 0:
+        at = SIZE * whose
         scale += about[at + SCALE]
         shown = scale * r + about[at + BIAS]
+        rows[0, at + SCALE] = r
+        rows[0, at + BIAS] = 1.0
+    if listener >= 0:
+        at = SIZE * listener
         direction += about[at + OFFSET] - about[at + YAW]
         rows[0, at + X], rows[0, at + Y] = -scale * dx / r, -scale * dy / r
         rows[0, at + YAW] = -scale * (dx * here_by[0] + dy * here_by[1]) / r
-        rows[0, at + SCALE] = r
-        rows[0, at + BIAS] = 1.0
         rows[1, at + X], rows[1, at + Y] = dy / flat, -dx / flat
         rows[1, at + YAW] = -1.0 + (dy * here_by[0] - dx * here_by[1]) / flat
         rows[1, at + OFFSET] = 1.0

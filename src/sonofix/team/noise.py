@@ -25,6 +25,9 @@ BEGIN_SD_RAD = 0.03
 LEAST = 1e-4
 """What nobody vouches for is told no better than by this share of the variance taken before anything was heard."""
 
+STATED_STAYS, STATED_NEW = 1.0, 0.5
+"""Where ranges state how good they are: deviations over that, of what stays of them and of what is new beyond it."""
+
 BEGIN_SHARE = 0.5
 """The part of a range's variance that stays, before measurements have told."""
 
@@ -58,8 +61,9 @@ class Noise:
 
     Attributes
     ----------
-    known : float64 (V + 2, OCTAVES, KINDS, 2)
-        Faded count, and sum of squares over the variance taken in the beginning; last row: of all listeners.
+    known : float64 (V + 2, OCTAVES, KINDS, 3)
+        Faded count, and sum of squares over the variance taken where nobody vouches; and what that is taken for before
+        measurements tell. Last row: of all listeners.
     fading : float64 (2,)
         How long, in s, an error stays, and for what change of range, as a share of that.
     runs : float64 (W, 2, 3)
@@ -79,10 +83,16 @@ class Noise:
     swell: Floats
 
 
-def noise(robots: int, views: int, believed: bool) -> Noise:
-    """Return what is known before anything was heard."""
+def noise(robots: int, views: int, believed: bool, stated_sd_m: float) -> Noise:
+    """Return what is known before anything was heard; ``stated_sd_m``: of ranges, NaN where nobody vouches for them."""
+    known = np.zeros((robots + 2, OCTAVES, KINDS, 3))
+    known[:, :, :, 2] = 1.0
+    if np.isfinite(stated_sd_m):
+        for kind, sd_m in ((STAYING, STATED_STAYS * stated_sd_m), (NEW, STATED_NEW * stated_sd_m)):
+            for k in range(OCTAVES):
+                known[:, k, kind, 2] = min(1.0, sd_m**2 / begun(kind, 2.0 ** (k - 2.5)))
     return Noise(
-        np.zeros((robots + 2, OCTAVES, KINDS, 2)),
+        known,
         believed,
         np.array([LASTING_S, KEPT_SHARE]),
         np.full((views, 2, 3), np.nan),
@@ -111,7 +121,7 @@ def begun(kind, range_m):
 def variance_of(known, listener, kind, range_m):
     """Return the variance (m² or rad²) of an error of a listener, as far as learnt; of ranges beyond what is stated."""
     k = octave(range_m)
-    every = (known[-1, k, kind, 1] + POOL) / (known[-1, k, kind, 0] + POOL)
+    every = (known[-1, k, kind, 1] + POOL * known[-1, k, kind, 2]) / (known[-1, k, kind, 0] + POOL)
     own = (known[listener, k, kind, 1] + POOL * every) / (known[listener, k, kind, 0] + POOL)
     return max(own, LEAST) * begun(kind, range_m)
 

@@ -78,7 +78,7 @@ def weigh(
         for k in range(len(mean)):
             both[:SIZE] = mean[k]
             shown, direction, _ = expect(
-                both, here, there, listener_point[i], source_point[i], flight_s_per_m, fast, row
+                both, here, there, listener_point[i], source_point[i], flight_s_per_m, fast, believed, row
             )
             before = mean[k].copy()
             for j in (1, 0):

@@ -21,7 +21,7 @@ from sonofix.team.hear import REFUSED, age, spread
 from sonofix.team.kernel import STRAYS, advance, drive, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
 from sonofix.team.pushed import SLIPPED, Push
-from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior_sd, wander_psd
+from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior, wander_psd
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
 
@@ -226,13 +226,11 @@ def _pass(
     count, n = nominal.shape
     robots = len(feed.robots)
     mean = nominal[0].copy()
-    pairs = n - SIZE * robots
-    sd = np.concatenate([np.tile(prior_sd(feed.own_ranges), robots), np.ones(pairs)])
-    covariance = np.diag(sd**2)
+    covariance = np.eye(n)
+    covariance[: SIZE * robots, : SIZE * robots] = prior(robots, feed.own_ranges, feed.scale_sd)
     mean[SIZE * robots :] = 0.0
     for r in range(robots):
         mean[SIZE * r + POSE : SIZE * (r + 1)] = 0.0
-        covariance[SIZE * r : SIZE * r + POSE] = 0.0
     psd = wander_psd(feed.own_ranges)
     bys, drive_noise, speed = np.zeros((count, robots, POSE, SIZE)), np.zeros((robots, POSE, POSE)), np.zeros(robots)
     means, covariances = np.empty((count, n)), np.empty((count, n, n))
@@ -262,7 +260,8 @@ def _pass(
         ends[k + 1] = _hear(
             mean, covariance, nominal[k], active[k], moment.rows, feed.kind, feed.listener, feed.source,
             feed.listener_point, feed.source_point, feed.range_m, feed.bearing_rad, feed.view, errors, weights,
-            judged is None, 1.0 / feed.sound_speed_mps, speed, used, kept, gains, totals, misses, int(ends[k]), work,
+            judged is None, 1.0 / feed.sound_speed_mps, speed, feed.own_ranges, used, kept, gains, totals, misses,
+            int(ends[k]), work,
         )  # fmt: skip
         means[k], covariances[k] = mean, covariance
         on_moment()
@@ -280,7 +279,7 @@ def _pass(
 @numba.njit(cache=True, error_model="numpy")
 def _hear(
     mean, covariance, about, active, rows, kind, listener, source, listener_point, source_point, range_m, bearing_rad,
-    view, errors, weights, gate, flight_s_per_m, speed, used, kept, gains, totals, misses, end, work,
+    view, errors, weights, gate, flight_s_per_m, speed, common, used, kept, gains, totals, misses, end, work,
 ):  # fmt: skip
     """Take rows in, linearised about a track, and keep what the way back needs; return where that ends."""
     n = len(mean)
@@ -300,7 +299,9 @@ def _hear(
             row[1, SIZE * a + YAW] = 1.0
             direction = about[SIZE * a + YAW]
         else:
-            shown, direction, _ = expect(about, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, row)
+            shown, direction, _ = expect(
+                about, a, b, listener_point[i], source_point[i], flight_s_per_m, speed, common, row
+            )
             if errors[i, STAYS] > 0.0:
                 row[0, first + view[i]] = errors[i, STAYS]
                 shown += errors[i, STAYS] * about[first + view[i]]
@@ -431,6 +432,7 @@ def _judge(feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArr
                     feed.source_point[i],
                     1.0 / feed.sound_speed_mps,
                     moment.speed_mps,
+                    feed.own_ranges,
                     row,
                 )
                 if errors[i, STAYS] > 0.0:

@@ -53,14 +53,18 @@ SETTLED_PSD = 1e-10
 """In units² a second: what stays as it is may still change so much, which keeps covariances well conditioned."""
 
 
-def prior_sd(own_ranges: bool) -> np.ndarray:
-    """Return deviations (SIZE,) before anything was heard; the pose's are those of a place that is not known.
+def prior(robots: int, own_ranges: bool, scale_sd: float = 0.0) -> np.ndarray:
+    """Return the covariance (SIZE V, SIZE V) of V robots' errors before anything was heard; of poses it holds nothing.
 
-    ``own_ranges``: ranges are the receiver's own, whose errors the site file states, so none are sought.
+    ``own_ranges``: ranges are the receiver's own, whose errors the site file states, so none are sought but one that
+    all ranges share, as their sound speed is off: a scale of deviation ``scale_sd``, the same for all robots.
     """
-    scale, bias = (0.0, 0.0) if own_ranges else (SCALE_SD, BIAS_SD_M)
+    scale, bias = (scale_sd, 0.0) if own_ranges else (SCALE_SD, BIAS_SD_M)
     errors = (WHEEL_SCALE_SD, WHEEL_SCALE_SD, BIAS_SD_RADPS, LAG_SD_S, scale, bias, OFFSET_SD_RAD, SLIP_SD, SLIP_SD)
-    return np.array([100.0, 100.0, np.pi, *errors])
+    covariance = np.diag(np.tile([0.0, 0.0, 0.0, *np.square(errors)], robots))
+    if own_ranges:
+        covariance[SCALE::SIZE, SCALE::SIZE] = scale_sd**2
+    return covariance
 
 
 def wander_psd(own_ranges: bool) -> np.ndarray:

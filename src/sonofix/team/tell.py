@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonofix.acquire import tones
-from sonofix.ranging import RANGES_WITHOUT_SD_M
+from sonofix.ranging import RANGES_WITHOUT_SD_M, with_sound_speed
 from sonofix.records import Estimate, Event, Floats, RangeEpoch, RangeRows, Source, Step
 from sonofix.team.feed import Feed
 from sonofix.team.fleet import Moment, instants
@@ -86,14 +86,20 @@ def _news(events: Sequence[Event], before: Sequence[_Tone], time_s: float) -> tu
 
 
 def ranges_of(epochs: Iterable[RangeEpoch]) -> RangeRows:
-    """Return the ranges that a receiver made of samples, or that exchanges are, each with its deviation."""
-    found = [
-        (float(e.time_s[i]), e.emitter[i], e.receiver[i], float(e.range_m[i]), float(np.sqrt(e.covariance_m2[i, i])))
-        for e in epochs
-        for i in range(len(e))
-    ]
+    """Return the ranges that a receiver made of samples, or that exchanges are, each with its deviation.
+
+    What all share, as the sound speed is off, is left out of these: it is `RangeRows.speed_sd_mps`.
+    """
+    found: list[tuple[float, str, str, float, float]] = []
+    speed_sd_mps = 0.0
+    for epoch in epochs:
+        speed_sd_mps = max(speed_sd_mps, epoch.sound_speed_sd_mps)
+        sd_m = np.sqrt(np.diag(with_sound_speed(epoch, epoch.sound_speed_mps, 0.0).covariance_m2))
+        ends = zip(epoch.time_s.tolist(), epoch.emitter, epoch.receiver, strict=True)
+        found += [(*end, r, sd) for end, r, sd in zip(ends, epoch.range_m.tolist(), sd_m.tolist(), strict=True)]
     time_s, emitter, receiver, range_m, sd_m = zip(*found, strict=True) if found else ((), (), (), (), ())
-    return RangeRows(np.array(time_s), tuple(emitter), tuple(receiver), np.array(range_m), np.array(sd_m))
+    told = np.array(time_s), tuple(emitter), tuple(receiver), np.array(range_m), np.array(sd_m)
+    return RangeRows(*told, speed_sd_mps=speed_sd_mps)
 
 
 def steps_of(
@@ -110,6 +116,7 @@ def steps_of(
         heard = [i for i in range(first, last) if np.isfinite(feed.range_m[i])]
         sd = feed.range_sd_m[heard]
         rate, rate_sd, snr_db = _shown(feed, heard, receiver)
+        shared_m = feed.scale_sd * feed.range_m[heard]
         before: list[Event] = []
         while events and (events[0].time_s <= moment.time_s or moment.time_s >= end_s):
             before.append(events.popleft())
@@ -120,12 +127,13 @@ def steps_of(
             receiver=tuple(feed.ends[i][1] for i in heard),
             time_s=feed.time_s[heard],
             range_m=feed.range_m[heard],
-            covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2),
+            covariance_m2=np.diag(np.where(np.isnan(sd), RANGES_WITHOUT_SD_M, sd) ** 2) + np.outer(shared_m, shared_m),
             range_rate_mps=rate,
             range_rate_sd_mps=rate_sd,
             snr_db=snr_db,
             clock="known",
             sound_speed_mps=feed.sound_speed_mps,
+            sound_speed_sd_mps=feed.scale_sd * feed.sound_speed_mps,
             sd_stated=not np.isnan(sd).any(),
         )
         entered = {
