@@ -91,6 +91,15 @@ def test_a_speed_that_is_held_is_the_sites(rng: np.random.Generator) -> None:
         assert not any(event.event == "sound-speed" for event in step.events)
 
 
+def test_the_command_tells_all_names() -> None:
+    from typer.testing import CliRunner
+
+    from sonofix.cli.main import app
+
+    told = " ".join(CliRunner().invoke(app, ["run", "--help"], env={"COLUMNS": "200"}).output.split())
+    assert all(name in told for name in CALIBRATIONS)
+
+
 def test_names_are_checked_and_told() -> None:
     with pytest.raises(ValueError, match=r"'range' is nothing that calibrates itself.*range-scale"):
         places(("range",), None)

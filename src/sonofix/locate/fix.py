@@ -84,11 +84,11 @@ def judged(
     rows, time_s = solver.rows, solver.time_s
     if len(rows) < solver.needed:
         text = f"{len(rows)} of {solver.needed} ranges; bring more beacons in reach or state what is known (z_m)"
-        return _failed(epoch, vehicle, time_s, "too-few", text)
+        return failed(epoch, vehicle, time_s, "too-few", text)
     everything = np.arange(len(rows))
     found = solver.candidates(everything)
     if not found:
-        return _failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
+        return failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
     misfit = found[0].chi2
     kept, found, isolated = exclude(solver, everything, found)
     best = found[0]
@@ -98,7 +98,7 @@ def judged(
     if not agrees(solver, len(kept), best.chi2):
         status, inflation = "inconsistent", best.chi2 / max(1, solver.degrees(len(kept)))
         if solver.descends(kept, best) > AT_REST * inflation:
-            return _failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
+            return failed(epoch, vehicle, time_s, "no-convergence", NO_PLACE)
         remedy = "ranges disagree and no single one explains it; check beacon positions, sound speed and echoes"
     elif not isolated:
         status, inflation = "inconsistent", misfit / solver.degrees(len(rows))
@@ -108,11 +108,11 @@ def judged(
     mirror_m = None if mirror is None else mirror.position_m.copy()
     if undecided:
         text = "two positions or headings fit alike; state the room's bounds_m or the vehicle's z_m, or move one beacon"
-        return replace(_failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=mirror_m)
+        return replace(failed(epoch, vehicle, time_s, "ambiguous", text), mirror_m=mirror_m)
     covariance = solver.covariance(best)
     if covariance is None or _too_weak(best, covariance * inflation, solver, kept):
         height = solver.level_m is None and _height_is_open(best)
-        return _failed(epoch, vehicle, time_s, "no-convergence", OPEN_HEIGHT if height else OPEN_DIRECTION)
+        return failed(epoch, vehicle, time_s, "no-convergence", OPEN_HEIGHT if height else OPEN_DIRECTION)
     if solver.tilts:
         covariance = covariance + solver.bent(kept, best, covariance)
     hpl_m = vpl_m = None
@@ -254,7 +254,8 @@ def _angle(angle_rad: float) -> float:
     return float(np.angle(np.exp(1j * angle_rad)))
 
 
-def _failed(epoch: RangeEpoch, vehicle: str, time_s: float, status: FixStatus, remedy: str) -> Fix:
+def failed(epoch: RangeEpoch, vehicle: str, time_s: float, status: FixStatus, remedy: str) -> Fix:
+    """Return the fix of a vehicle whose position an epoch does not tell, and what would help."""
     nothing = np.zeros(len(epoch), bool)
     return Fix(
         time_s,

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sonofix.locate.fix import failed
 from sonofix.records import Fix, Floats, RangeEpoch, Table
 from sonofix.site import Site
 
@@ -21,15 +22,18 @@ def told_fixes(table: Table, site: Site) -> Iterator[tuple[RangeEpoch, tuple[Fix
     that has one (`z_m` of the site) stands above that of a row.
     """
     columns, count = table.columns, len(table.columns["time_s"])
+    if not count:
+        return
     whose = table.names.get("vehicle") or (site.vehicles[0].id,) * count
     sd_m = np.full(count, np.nan) if "sd_m" not in columns else columns["sd_m"]
     sds_m: list[float] = np.where(np.isnan(sd_m), WITHOUT_SD_M, sd_m).tolist()
     height_m = columns.get("z_m", np.full(count, np.nan))
     order = np.argsort(columns["time_s"], kind="stable")
-    for k, time_s in enumerate(np.unique(columns["time_s"]).tolist()):
+    times, first = np.unique(columns["time_s"][order], return_index=True)
+    for k, (time_s, rows) in enumerate(zip(times.tolist(), np.split(order, first[1:]), strict=True)):
         epoch = _silent(k, time_s, site)
         own: dict[str, Fix] = {}
-        for i in order[columns["time_s"][order] == time_s].tolist():
+        for i in rows.tolist():
             level_m = site.vehicle(whose[i]).z_m
             z = height_m[i] if level_m is None else level_m
             place = np.array([columns["x_m"][i], columns["y_m"][i], z])
@@ -50,24 +54,7 @@ def _told(epoch: RangeEpoch, vehicle: str, position_m: Floats, states: tuple[str
 
 def _untold(epoch: RangeEpoch, vehicle: str) -> Fix:
     """Return the fix of a vehicle of which an epoch tells nothing."""
-    return Fix(
-        time_s=epoch.sync_s,
-        vehicle=vehicle,
-        status="too-few",
-        remedy="no position at this instant",
-        states=(),
-        position_m=None,
-        velocity_mps=None,
-        yaw_rad=None,
-        clock_offset_m=None,
-        covariance=None,
-        hdop=None,
-        vdop=None,
-        hpl_m=None,
-        vpl_m=None,
-        used=np.zeros(0, bool),
-        residual_m=np.zeros(0),
-    )
+    return failed(epoch, vehicle, epoch.sync_s, "too-few", "no position at this instant")
 
 
 def _silent(index: int, time_s: float, site: Site) -> RangeEpoch:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, YAW
 from sonofix.records import Floats
-from sonofix.track.kernel import joseph
+from sonofix.track.kernel import joseph, stir
 
 AGILE_TURN_PSD = 20.0
 """White angular acceleration in rad²/s³ that a vehicle whose turns a sensor tells adds to that of others: it turns on
@@ -35,19 +35,7 @@ def free_turns(covariance: Floats, free: NDArray[np.bool_], vehicle: int, dt: fl
     """Let a vehicle whose heading is followed turn for ``dt``, in place, as freely as rows of a sensor may tell."""
     at = SIZE * vehicle + YAW
     if free[at]:
-        stir(covariance, at, AGILE_TURN_PSD, dt)
-
-
-def stir(covariance: Floats, at: int, density: float, dt: float) -> None:
-    """Let state ``at``, whose rate stands 4 behind, be disturbed for ``dt``, in place, by white acceleration.
-
-    Bar-Shalom 2001, eq 6.2.2-12.
-    """
-    span = abs(dt)
-    covariance[at, at] += density * span**3 / 3
-    covariance[at, at + 4] += density * dt * span / 2
-    covariance[at + 4, at] += density * dt * span / 2
-    covariance[at + 4, at + 4] += density * span
+        stir(covariance, at, at + 4, AGILE_TURN_PSD, dt)
 
 
 def correct(mean: Floats, covariance: Floats, miss: Floats, derivative: Floats, noise: Floats, unlikely: float) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, YAW, YAW_RATE
 from sonofix.records import Floats
+from sonofix.track.kernel import fade, stir
 
 STRAIGHT_S = 5.0
 """Within so long a course forgets its turn."""
@@ -35,8 +36,8 @@ def bend(mean, covariance, free, vehicle, density, dt):
 
     With ω the rate of turn, s = sin(ω dt)/ω and c = (1 − cos(ω dt))/ω: p' = p + (s, −c; c, s) v and v' = R(ω dt) v.
     """
-    n, x = len(mean), SIZE * vehicle
-    vx, vy, rate, span = x + 4, x + 5, mean[x + YAW_RATE], abs(dt)
+    x = SIZE * vehicle
+    vx, vy, rate = x + 4, x + 5, mean[x + YAW_RATE]
     angle = rate * dt
     cos, sin = np.cos(angle), np.sin(angle)
     if abs(angle) < 1e-4:
@@ -57,37 +58,23 @@ def bend(mean, covariance, free, vehicle, density, dt):
     mean[x] += along * u - aside * v
     mean[x + 1] += aside * u + along * v
     mean[vx], mean[vy] = cos * u - sin * v, sin * u + cos * v
-    for swap in range(2):
-        for k in range(n):
-            if swap == 0:
-                a, b, w = covariance[vx, k], covariance[vy, k], covariance[x + YAW_RATE, k]
-                covariance[x, k] += along * a - aside * b + turned[0] * w
-                covariance[x + 1, k] += aside * a + along * b + turned[1] * w
-                covariance[vx, k] = cos * a - sin * b + turned[2] * w
-                covariance[vy, k] = sin * a + cos * b + turned[3] * w
-            else:
-                a, b, w = covariance[k, vx], covariance[k, vy], covariance[k, x + YAW_RATE]
-                covariance[k, x] += along * a - aside * b + turned[0] * w
-                covariance[k, x + 1] += aside * a + along * b + turned[1] * w
-                covariance[k, vx] = cos * a - sin * b + turned[2] * w
-                covariance[k, vy] = sin * a + cos * b + turned[3] * w
+    linear = (cos, sin, along, aside)
+    _carry(covariance, x, linear, turned)
+    _carry(covariance.T, x, linear, turned)
     # white acceleration is the same from all sides: a turn leaves its integral's noise as it is
     for at in (x, x + 1):
-        covariance[at + 4, at + 4] += density * span
-        covariance[at, at] += density * span**3 / 3
-        covariance[at, at + 4] += density * dt * span / 2
-        covariance[at + 4, at] += density * dt * span / 2
+        stir(covariance, at, at + 4, density, dt)
     if free[x + YAW_RATE] and not free[x + YAW]:
-        _fade(mean, covariance, x + YAW_RATE, span)
+        fade(mean, covariance, x + YAW_RATE, np.exp(-abs(dt) / STRAIGHT_S), TURN_SD_RADPS**2)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _fade(mean, covariance, at, span):
-    """Let a course forget its turn: a first-order Gauss–Markov process (Gelb 1974, section 3.7)."""
-    left = np.exp(-span / STRAIGHT_S)
-    mean[at] *= left
-    for k in range(len(mean)):
-        covariance[at, k] *= left
-    for k in range(len(mean)):
-        covariance[k, at] *= left
-    covariance[at, at] += TURN_SD_RADPS**2 * (1.0 - left**2)
+def _carry(rows, x, linear, turned):
+    """Move rows of a covariance as `bend` moves the states: by velocity, and as they answer to the rate of turn."""
+    cos, sin, along, aside = linear
+    for k in range(len(rows)):
+        a, b, w = rows[x + 4, k], rows[x + 5, k], rows[x + YAW_RATE, k]
+        rows[x, k] += along * a - aside * b + turned[0] * w
+        rows[x + 1, k] += aside * a + along * b + turned[1] * w
+        rows[x + 4, k] = cos * a - sin * b + turned[2] * w
+        rows[x + 5, k] = sin * a + cos * b + turned[3] * w

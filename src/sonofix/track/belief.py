@@ -18,6 +18,7 @@ from sonofix.track.anchor import lift
 from sonofix.track.arc import bend, open_course
 from sonofix.track.held import hold, places
 from sonofix.track.inputs import GYRO, STEP, WHEELS, Inputs
+from sonofix.track.kernel import stir
 from sonofix.track.stated import Trust
 from sonofix.track.tilt import open_tilt, rock
 
@@ -203,17 +204,16 @@ def blank(site: Site, inputs: Inputs | None = None, held: Iterable[str] = ()) ->
 @numba.njit(cache=True, error_model="numpy")
 def drift(mean, covariance, at, rate, free, density, dt):
     """Let a state age by its rate, in place, with white acceleration of a density; ``free``: it is not sure itself."""
-    n, span = len(mean), abs(dt)
+    n = len(mean)
     mean[at] += dt * mean[rate]
     for k in range(n):
         covariance[at, k] += dt * covariance[rate, k]
     for k in range(n):
         covariance[k, at] += dt * covariance[k, rate]
-    covariance[rate, rate] += density * span
     if free:
-        covariance[at, at] += density * span**3 / 3
-        covariance[at, rate] += density * dt * span / 2
-        covariance[rate, at] += density * dt * span / 2
+        stir(covariance, at, rate, density, dt)
+    else:
+        covariance[rate, rate] += density * abs(dt)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""What every filter here is made of: Joseph's form, and one scalar measurement at a time by it, as a compiled kernel.
+"""What every filter here is made of: Joseph's form, one scalar measurement at a time by it, and noise that ages states.
 
 Rows that share noise are whitened first (`locate.dense.whitener`); taken one by one they then give the very same result
 as together, without a matrix to invert (Bierman 1977, section II.7).
@@ -20,6 +20,33 @@ def joseph(before: Floats, gain: Floats, derivative: Floats, noise: Floats) -> F
     keep = np.eye(len(before)) - gain @ derivative
     after = keep @ before @ keep.T + gain @ noise @ gain.T
     return (after + after.T) / 2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def stir(covariance, at, rate, density, dt):
+    """Let state ``at`` and its ``rate`` be disturbed for ``dt``, in place, by white acceleration of a density.
+
+    Bar-Shalom 2001, eq 6.2.2-12.
+    """
+    span = abs(dt)
+    covariance[rate, rate] += density * span
+    covariance[at, at] += density * span**3 / 3
+    covariance[at, rate] += density * dt * span / 2
+    covariance[rate, at] += density * dt * span / 2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def fade(mean, covariance, at, left, variance):
+    """Let a state fade, in place, to the share ``left``, while noise keeps its ``variance``.
+
+    A first-order Gauss–Markov process (Gelb 1974, section 3.7).
+    """
+    mean[at] *= left
+    for k in range(len(mean)):
+        covariance[at, k] *= left
+    for k in range(len(mean)):
+        covariance[k, at] *= left
+    covariance[at, at] += variance * (1.0 - left**2)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -21,6 +21,7 @@ from sonofix.records import Floats
 from sonofix.track import stated
 from sonofix.track.belief import Belief, Motion, drift
 from sonofix.track.held import hold
+from sonofix.track.kernel import fade
 from sonofix.track.tilt import step_of
 
 QUICK_M = (0.3, 1.0, 3.0)
@@ -116,14 +117,8 @@ def go(mean, covariance, free, member, dt, densities, tilt, tilt_noise, slot, pa
                 p[rate, rate] += tilt_noise[1, 1]
         slow, quick = np.exp(-span / lasting_s), np.exp(-span / member[k, 2])
         for i in range(first, first + 2 * pairs):
-            fade = slow if i < first + pairs else quick
-            x[i] *= fade
-            for j in range(n):
-                p[i, j] *= fade
-            for j in range(n):
-                p[j, i] *= fade
             sd = member[k, 0] if i < first + pairs else member[k, 1]
-            p[i, i] += sd * sd * (1.0 - fade * fade)
+            fade(x, p, i, slow if i < first + pairs else quick, sd * sd)
 
 
 @numba.njit(cache=True, error_model="numpy")

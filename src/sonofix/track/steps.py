@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE
 from sonofix.records import Floats
-from sonofix.track.anchor import correct, open_errors, stir
+from sonofix.track.anchor import correct, open_errors
+from sonofix.track.kernel import fade, stir
 
 LENGTH_SD = 0.05 / 0.6
 """Of the slow error of step length, as a share of it: 5 cm of a step of 60 cm."""
@@ -43,16 +44,13 @@ def wander(mean: Floats, covariance: Floats, vehicle: int, slot: int, dt: float,
 
     The errors fade towards zero with `CORRELATED_S` while noise keeps their variance (Gelb 1974, section 3.7).
     """
-    fade = float(np.exp(-abs(dt) / CORRELATED_S))
+    left = float(np.exp(-abs(dt) / CORRELATED_S))
     for i, sd in ((slot + 2, LENGTH_SD), (slot + 3, HEADING_SD_RAD)):
-        mean[i] *= fade
-        covariance[i, :] *= fade
-        covariance[:, i] *= fade
-        covariance[i, i] += sd**2 * (1.0 - fade**2)
+        fade(mean, covariance, i, left, sd**2)
     if not placed:
         return
     for at in (SIZE * vehicle, SIZE * vehicle + 1):
-        stir(covariance, at, AGILE_PSD, dt)
+        stir(covariance, at, at + 4, AGILE_PSD, dt)
 
 
 def take(
