@@ -132,7 +132,7 @@ def street_step(task: Task) -> Step:
     motion, asked, index = Motion(), np.ones(n, bool), np.ix_(own, own)
 
     def step() -> tuple[Floats, Floats]:
-        after, _, _ = update(predict(belief, PERIOD_S, motion), epoch, links, asked, iterations=1)
+        after, *_ = update(predict(belief, PERIOD_S, motion), epoch, links, asked, iterations=1)
         return after.mean[own], after.covariance[index]
 
     return step

@@ -395,11 +395,32 @@ class Event:
     detail: str
 
 
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """How far measurements that entered a track at once lay from what was expected of them.
+
+    Attributes
+    ----------
+    time_s : float
+        The instant that the track was corrected for.
+    rows : int
+        Measurements: ranges and range rates, or coordinates.
+    nis : float
+        Normalised innovation squared, yᵀ S⁻¹ y: χ² of as many degrees where all covariances are right (Bar-Shalom, Li
+        and Kirubarajan 2001, section 5.4).
+    """
+
+    time_s: float
+    rows: int
+    nis: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
     """What one epoch brought: the row of the street from ranges to estimates.
 
     ``exchanges``: what robots on clocks of their own heard of each other, where ranges come from that.
+    ``innovations``: what entered the track, and how far from where it was expected.
     """
 
     ranges: RangeEpoch
@@ -409,6 +430,7 @@ class Step:
     range_used: NDArray[np.bool_]
     range_clock_offset_m: Floats
     exchanges: tuple[Exchange, ...] = ()
+    innovations: tuple[Innovation, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -93,7 +93,10 @@ class Street:
             believed[:] = False
         if self.rate_hz is not None:
             estimates = self._between(before, hidden, estimates)
-        return Step(epoch, fixes, estimates, flags + told + events, believed & np.isfinite(offset), offset)
+        entered = self.follower.innovation
+        innovations = (entered,) if entered is not None and not any(event.event == "late" for event in events) else ()
+        told = flags + told + events
+        return Step(epoch, fixes, estimates, told, believed & np.isfinite(offset), offset, innovations=innovations)
 
     def begin(self, time_s: float) -> None:
         """Put vehicles where start.csv says, once: at the first epoch, or where sensors tell of motion earlier."""

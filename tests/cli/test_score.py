@@ -34,6 +34,7 @@ def folder(tmp_path) -> Path:
         "time_s,vehicle,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,yaw_rad,sd_x_m,sd_y_m,sd_z_m,sd_yaw_rad,source\n"
         "1.0,agv,3.02,4.0,0.0,0.1,0.0,0.0,,0.02,0.02,,,fused\n"
     )
+    (tmp_path / "out" / "innovations.csv").write_text("time_s,rows,nis\n1.0,2,3.0\n1.5,2,1.0\n")
     return tmp_path
 
 
@@ -50,12 +51,20 @@ def test_figures_as_json(folder):
     assert track["velocity_rms_mps"] == pytest.approx(0.1)
     assert track["longest_gap_s"] == pytest.approx(9.0)
     assert track["rmse_yaw_rad"] is None
+    assert found["innovations"] == {
+        "corrections": 2,
+        "rows": 4,
+        "nis_per_row": 1.0,
+        "inside_95": 1.0,
+        "below": 0.0,
+        "above": 0.0,
+    }
 
 
 def test_figures_as_table(folder):
     told = runner.invoke(app, ["score", str(folder), str(folder / "out")])
     assert told.exit_code == 0, told.stderr
-    for words in ("Ranges", "10.0 mm", "Track", "20.0 mm", "agv", "9.00 s", "100.0 mm/s"):
+    for words in ("Ranges", "10.0 mm", "Track", "20.0 mm", "agv", "9.00 s", "100.0 mm/s", "NIS per measurement"):
         assert words in told.stdout
     # what is not known has no row
     assert "heading" not in told.stdout

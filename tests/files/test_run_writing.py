@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sonofix.files import RecordingError, RunWriter, write_run
-from sonofix.records import Estimate, Event, Fix, RangeEpoch, Step
+from sonofix.records import Estimate, Event, Fix, Innovation, RangeEpoch, Step
 from sonofix.site import Beacon, Microphone, Site, Vehicle
 
 SITE = Site(
@@ -83,6 +83,7 @@ def step(index: int, ranges: RangeEpoch | None = None, **parts) -> Step:
         events=parts.get("events", ()),
         range_used=parts.get("used", np.ones(n, bool)),
         range_clock_offset_m=parts.get("offset", np.full(n, np.nan)),
+        innovations=parts.get("innovations", ()),
     )
 
 
@@ -99,6 +100,7 @@ def test_columns_are_those_of_the_format(tmp_path):
         "fixes.csv": "time_s,vehicle,status,x_m,y_m,z_m,yaw_rad,clock_offset_m,cxx_m2,cxy_m2,cyy_m2,czz_m2,"
         "hdop,vdop,hpl_m,vpl_m,heard,used,excluded",
         "events.csv": "time_s,vehicle,event,detail",
+        "innovations.csv": "time_s,rows,nis",
     }
     assert {path.name: path.read_text() for path in tmp_path.glob("*.csv")} == {
         k: v + "\n" for k, v in expected.items()
@@ -185,6 +187,11 @@ def test_a_tum_trajectory_per_vehicle(tmp_path):
     write_run(tmp_path / "two", [step(0, estimates=pair, fixes=())], TEAM)
     assert np.loadtxt(tmp_path / "two" / "track-K.tum").shape == (8,)
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "two" / "track-R_2.tum")[4:], [0, 0, 0, 1])
+
+
+def test_innovations_are_rows(tmp_path):
+    write_run(tmp_path, [step(0, innovations=(Innovation(0.21, 8, 7.25),)), step(1)], SITE)
+    assert (tmp_path / "innovations.csv").read_text() == "time_s,rows,nis\n0.210000000,8,7.25\n"
 
 
 def test_an_events_detail_may_hold_anything(tmp_path):

@@ -36,6 +36,8 @@ def test_an_acceleration_grows_with_time_for_rates_and_its_square_for_ranges() -
     covariance = row_noise(epoch, links, np.arange(3), dt)
     np.testing.assert_allclose(np.diag(covariance[:3, :3]), 0.01**2 + (MANOEUVRE_MPS2 * dt**2 / 2) ** 2)
     np.testing.assert_allclose(covariance[3:, 3:], np.diag(0.05**2 + (MANOEUVRE_MPS2 * dt) ** 2))
+    steady = row_noise(epoch, links, np.arange(3), dt, agile_mps2=0.0)
+    np.testing.assert_allclose(steady, np.diag(np.repeat([0.01**2, 0.05**2], 3)))
 
 
 def test_a_misplaced_beacon_errs_alike_for_all_who_hear_it() -> None:

@@ -49,7 +49,7 @@ def test_steady_state_gains_are_those_of_the_alpha_beta_filter(index: float) -> 
     for k in range(1, 400):
         epoch = make_epoch(site, Drive((0.0, 0.0, 0.0)), k * period_s, sd_m=sd_m)
         belief = predict(belief, k * period_s, motion)
-        belief, used, _ = update(belief, epoch, link(site, epoch.emitter, epoch.receiver), np.ones(1, bool))
+        belief, used, *_ = update(belief, epoch, link(site, epoch.emitter, epoch.receiver), np.ones(1, bool))
         assert used.all()
     # the gain is P⁺ Hᵀ / σ²
     gain = belief.covariance[[0, 4], 0] / sd_m**2

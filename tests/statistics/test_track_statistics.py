@@ -206,7 +206,7 @@ def drive_on(updates: int, rng: np.random.Generator) -> tuple[Belief, float, flo
         if k % 3 == 0:
             epoch = rows_of(epoch, [int(rng.integers(6))])
         links = link(site, epoch.emitter, epoch.receiver)
-        belief, _, _ = update(belief, epoch, links, np.ones(len(epoch), bool))
+        belief, *_ = update(belief, epoch, links, np.ones(len(epoch), bool))
         if k % 10 == 0:
             part = belief.covariance[np.ix_(own, own)]
             smallest = min(smallest, float(np.linalg.eigvalsh(part).min()))

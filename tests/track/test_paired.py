@@ -15,7 +15,7 @@ from sonofix.site import Pair, Site
 from sonofix.track.belief import Motion, blank
 from sonofix.track.follow import Follower
 from sonofix.track.inputs import gather
-from sonofix.track.update import noise_of, pairs_of
+from sonofix.track.update import expect, noise_of, pairs_of
 
 PLACE = (3.0, 5.5, 1.1)
 BIAS_SD_M = 0.02
@@ -99,7 +99,9 @@ def test_pairs_that_are_not_stated_have_no_state(rng: np.random.Generator) -> No
     belief, rows = blank(site, inputs), np.arange(len(epoch))
     pair = pairs_of(belief, epoch, rows)
     assert pair.tolist() == [0, 1, -1, -1, -1, -1]
-    noise = noise_of(belief, epoch, link(site, epoch.emitter, epoch.receiver), rows, np.zeros(len(epoch)), pair)
+    links, dt = link(site, epoch.emitter, epoch.receiver), np.zeros(len(epoch))
+    derivative = expect(links, belief, belief.mean, dt, epoch, pair)[1]
+    noise = noise_of(belief, epoch, links, rows, dt, pair, derivative)
     np.testing.assert_allclose(np.diag(noise), 0.002**2)
     assert gather(make_site(HALL), {}) is None
     # a bias that is known for sure needs none

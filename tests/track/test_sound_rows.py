@@ -36,7 +36,9 @@ def believed(site: Site, mean: Floats, covariance: Floats = PRIOR) -> Belief:
 
 
 def corrected(belief: Belief, epoch: RangeEpoch, site: Site) -> tuple[Belief, list[bool], Floats]:
-    after, used, surprise = update(belief, epoch, link(site, epoch.emitter, epoch.receiver), np.ones(len(epoch), bool))
+    after, used, surprise, _ = update(
+        belief, epoch, link(site, epoch.emitter, epoch.receiver), np.ones(len(epoch), bool)
+    )
     return after, used.tolist(), surprise
 
 

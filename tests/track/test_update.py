@@ -9,10 +9,11 @@ import pytest
 
 from locate.made_epochs import HALL, Drive, make_epoch, make_site, rows_of, shifted
 from sonofix.geometry import SIZE, Links, link
+from sonofix.locate.noise import MANOEUVRE_MPS2, row_noise
 from sonofix.records import Floats, RangeEpoch
 from sonofix.site import Site
 from sonofix.track.belief import Belief, Motion, blank, predict
-from sonofix.track.update import GATE_SIGMA, update
+from sonofix.track.update import GATE_SIGMA, MANOEUVRE_RADPS2, expect, noise_of, update
 
 PLACE = (3.0, 5.5, 1.1)
 FREE = np.array([0, 1, 2, 4, 5, 6])
@@ -56,11 +57,15 @@ def test_linear_rows_give_the_textbook_kalman_filter(rng: np.random.Generator) -
         epoch = make_epoch(site, Drive(place), time_s, sd_m=sd)
         epoch = replace(epoch, range_m=FAR_M + h[:, :3] @ place + sd * rng.standard_normal(7))
         belief = predict(belief, time_s, motion)
-        belief, used, _ = update(belief, epoch, *everything(epoch, site))
+        belief, used, _, innovation = update(belief, epoch, *everything(epoch, site))
         assert used.all()
         mean, covariance = step @ mean, step @ covariance @ step.T + noise
-        gain = covariance @ h.T @ np.linalg.inv(h @ covariance @ h.T + sd**2 * np.eye(7))
-        mean = mean + gain @ (epoch.range_m - FAR_M - h @ mean)
+        expected, miss = h @ covariance @ h.T + sd**2 * np.eye(7), epoch.range_m - FAR_M - h @ mean
+        assert innovation is not None
+        assert (innovation.time_s, innovation.rows) == (time_s, 7)
+        assert innovation.nis == pytest.approx(miss @ np.linalg.solve(expected, miss), rel=1e-4)
+        gain = covariance @ h.T @ np.linalg.inv(expected)
+        mean = mean + gain @ miss
         covariance = (np.eye(6) - gain @ h) @ covariance
         # at 1e8 m a double resolves 1.5e-8 m
         np.testing.assert_allclose(belief.mean[FREE], mean, atol=2e-7)
@@ -80,7 +85,7 @@ def test_rates_and_an_unknown_clock_in_the_textbook_filter(rng: np.random.Genera
         range_rate_mps=unit @ velocity + 0.02,
         range_rate_sd_mps=np.full(7, 0.04),
     )
-    got, used, _ = update(believed(site, mean, covariance, clock=True), epoch, *everything(epoch, site))
+    got, used, *_ = update(believed(site, mean, covariance, clock=True), epoch, *everything(epoch, site))
     assert used.all()
     zero, one = np.zeros((7, 3)), np.ones((7, 1))
     # the clock's offset is in every range, its speed in every rate
@@ -98,7 +103,7 @@ def test_iterations_find_the_most_likely_place(rng: np.random.Generator) -> None
     site = make_site(HALL)
     mean, covariance = np.array([3.4, 5.1, 1.5, 0, 0, 0]), np.diag([0.5**2] * 3 + [0.1**2] * 3)
     epoch = make_epoch(site, Drive(PLACE), rng=rng)
-    got, _, _ = update(believed(site, mean, covariance), epoch, *everything(epoch, site), iterations=20)
+    got, *_ = update(believed(site, mean, covariance), epoch, *everything(epoch, site), iterations=20)
     x = mean.copy()
     for _ in range(50):
         away = x[:3] - np.array(HALL)
@@ -114,7 +119,7 @@ def test_one_beacon_alone_still_helps_along_its_direction() -> None:
     site = make_site(HALL)
     belief = believed(site, np.array([*PLACE, 0, 0, 0]), np.diag([0.1**2] * 6))
     epoch = rows_of(make_epoch(site, Drive(PLACE), sd_m=0.001), [0])
-    got, used, _ = update(belief, epoch, *everything(epoch, site))
+    got, used, *_ = update(belief, epoch, *everything(epoch, site))
     assert used.tolist() == [True]
     unit = np.array(PLACE) - np.array(HALL[0])
     unit /= np.linalg.norm(unit)
@@ -128,9 +133,9 @@ def test_a_row_far_from_what_is_expected_is_left_out_and_no_other(rng: np.random
     site = make_site(HALL)
     belief = believed(site, np.array([*PLACE, 0, 0, 0]), np.diag([0.02**2] * 6))
     epoch = make_epoch(site, Drive(PLACE), rng=rng)
-    plain, _, _ = update(belief, rows_of(epoch, [0, 1, 3, 4, 5]), *everything(rows_of(epoch, [0, 1, 3, 4, 5]), site))
+    plain, *_ = update(belief, rows_of(epoch, [0, 1, 3, 4, 5]), *everything(rows_of(epoch, [0, 1, 3, 4, 5]), site))
     faulty = shifted(epoch, 2, 0.5)
-    got, used, surprise = update(belief, faulty, *everything(faulty, site))
+    got, used, surprise, _ = update(belief, faulty, *everything(faulty, site))
     assert used.tolist() == [True, True, False, True, True, True]
     np.testing.assert_allclose(got.mean, plain.mean, atol=1e-12)
     np.testing.assert_allclose(got.covariance, plain.covariance, atol=1e-15)
@@ -145,7 +150,7 @@ def test_a_rate_far_from_what_is_expected_condemns_its_row() -> None:
     rate = epoch.range_rate_mps.copy()
     rate[4] += 2.0
     epoch = replace(epoch, range_rate_mps=rate)
-    _, used, _ = update(belief, epoch, *everything(epoch, site))
+    _, used, *_ = update(belief, epoch, *everything(epoch, site))
     assert used.tolist() == [True] * 4 + [False, True]
 
 
@@ -155,7 +160,7 @@ def test_rows_that_are_not_candidates_do_not_enter() -> None:
     epoch = make_epoch(site, Drive(PLACE))
     links, _ = everything(epoch, site)
     asked = np.array([False, True, False, True, False, False])
-    _, used, surprise = update(belief, epoch, links, asked)
+    _, used, surprise, _ = update(belief, epoch, links, asked)
     assert used.tolist() == asked.tolist()
     assert len(surprise) == 2
 
@@ -170,7 +175,7 @@ def test_nothing_to_go_by_changes_nothing(why: str) -> None:
     if why == "nobody placed":
         belief = replace(belief, placed=np.zeros(1, bool))
     links, asked = everything(epoch, site)
-    got, used, surprise = update(belief, epoch, links, asked & (why != "none asked"))
+    got, used, surprise, _ = update(belief, epoch, links, asked & (why != "none asked"))
     assert got is belief
     assert not used.any()
     assert len(used) == len(epoch)
@@ -184,7 +189,7 @@ def test_rows_are_taken_at_their_own_moments() -> None:
     times = np.array([-0.04, 0.04, -0.02, 0.02, 0.03, -0.03])
     belief = believed(site, np.array([*PLACE, *drive.velocity_mps]), np.diag([0.1**2] * 3 + [0.01**2] * 3))
     epoch = make_epoch(site, drive, times, sd_m=0.001)
-    got, used, _ = update(belief, epoch, *everything(epoch, site))
+    got, used, *_ = update(belief, epoch, *everything(epoch, site))
     assert used.all()
     np.testing.assert_allclose(got.mean[:3], PLACE, atol=1e-6)
 
@@ -195,7 +200,42 @@ def test_a_covariance_stays_positive_through_updates_of_any_precision(rng: np.ra
     belief = believed(site, np.array([*PLACE, 0, 0, 0]), random_covariance(rng, 6, 1.0))
     for sd in (1e-6, 1.0, 1e-4, 1e-6, 1e-6):
         epoch = make_epoch(site, Drive(PLACE), sd_m=sd)
-        belief, _, _ = update(belief, epoch, *everything(epoch, site))
+        belief, *_ = update(belief, epoch, *everything(epoch, site))
         own = belief.covariance[np.ix_(FREE, FREE)]
         np.testing.assert_array_equal(own, own.T)
         assert np.linalg.eigvalsh(own).min() > 0
+
+
+def test_rows_of_an_epoch_share_one_acceleration() -> None:
+    # what a row shows is shifted by an acceleration of one deviation, axis by axis: its place by a dt² / 2, its
+    # velocity by a dt
+    site = make_site(HALL, arms_m=((0.2, 0.0, 0.0), (-0.2, 0.1, 0.0)))
+    epoch = make_epoch(site, Drive(PLACE, (0.8, -0.4, 0.0)), sd_m=0.002, rate_sd_mps=0.003)
+    links, rows = link(site, epoch.emitter, epoch.receiver), np.arange(len(epoch))
+    dt = np.linspace(-0.04, 0.06, len(rows))
+    empty = blank(site)
+    mean, free = empty.mean.copy(), empty.free.copy()
+    mean[:8] = [*PLACE, 0.7, 0.8, -0.4, 0.0, 0.2]
+    free[[0, 1, 3, 4, 5, 7]] = True
+    belief = replace(empty, mean=mean, free=free, placed=np.ones(1, bool))
+    pair = np.zeros(0, np.int64)
+
+    def shown(axis: int, acceleration: float) -> Floats:
+        def at(i: int) -> Floats:
+            moved = mean.copy()
+            moved[axis] += acceleration * dt[i] ** 2 / 2 - acceleration * dt[i] * dt[i]
+            moved[axis + 4] += acceleration * dt[i]
+            return expect(links, belief, moved, dt, epoch, pair)[0][[i, len(rows) + i]]
+
+        told = np.array([at(i) for i in rows])
+        return told.T.ravel()
+
+    plain = row_noise(epoch, links, rows, dt, agile_mps2=0.0)
+    expected, small = plain.copy(), 1e-4
+    for axis, sd in ((0, MANOEUVRE_MPS2), (1, MANOEUVRE_MPS2), (3, MANOEUVRE_RADPS2)):
+        slope = (shown(axis, small) - shown(axis, -small)) / (2 * small)
+        expected += sd**2 * np.outer(slope, slope)
+    derivative = expect(links, belief, mean, dt, epoch, pair)[1]
+    got = noise_of(belief, epoch, links, rows, dt, pair, derivative)
+    np.testing.assert_allclose(got, expected, atol=1e-6 * float(expected.max()))
+    assert got.diagonal().max() > 20 * plain.diagonal().max()

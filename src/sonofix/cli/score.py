@@ -13,7 +13,7 @@ from sonofix.cli.console import figure_text, length_text, print_table
 
 if TYPE_CHECKING:
     from sonofix.records import Floats, Table
-    from sonofix.score import RangeColumns, RangeFigures, TrackColumns, TrackFigures
+    from sonofix.score import InnovationFigures, RangeColumns, RangeFigures, TrackColumns, TrackFigures
     from sonofix.site import Site
 
 
@@ -37,14 +37,17 @@ def score(
         print_table("Track", tuple(scored.track), track_rows(scored.track))
     else:
         typer.echo("No row of track.csv lies in the time of the truth.")
+    if scored.innovations is not None:
+        print_table("Measurements against what the causal track expected", ("",), _nis_rows(scored.innovations))
 
 
 @dataclass(frozen=True, slots=True)
 class Scored:
-    """Figures of one run: of its ranges (None where it wrote none), and of each vehicle's track."""
+    """Figures of one run: of its ranges and innovations (None where it wrote none), and of each vehicle's track."""
 
     ranges: RangeFigures | None
     track: Mapping[str, TrackFigures]
+    innovations: InnovationFigures | None
 
 
 def score_run(recording: Path, out: Path) -> Scored:
@@ -77,7 +80,26 @@ def score_run(recording: Path, out: Path) -> Scored:
     return Scored(
         ranges=None if ranges is None else score_ranges(site, truths, ranges, speed),
         track={vehicle: found for vehicle, found in figures.items() if found is not None},
+        innovations=_innovations(out / "innovations.csv"),
     )
+
+
+def _innovations(path: Path) -> InnovationFigures | None:
+    from sonofix.files.results import read_innovations
+    from sonofix.score import score_innovations
+
+    table = read_innovations(path)
+    return None if table is None else score_innovations(table.columns["rows"], table.columns["nis"])
+
+
+def _nis_rows(figures: InnovationFigures) -> dict[str, list[str]]:
+    return {
+        "corrections": [str(figures.corrections)],
+        "measurements": [str(figures.rows)],
+        "NIS per measurement (1 is right)": [figure_text(figures.nis_per_row, ".2f")],
+        "inside their 95 % band": [figure_text(100 * figures.inside_95, ".1f", "%")],
+        "below it, above it": [f"{100 * figures.below:.1f} %, {100 * figures.above:.1f} %"],
+    }
 
 
 def range_columns(path: Path) -> RangeColumns | None:

@@ -19,6 +19,7 @@ _NEEDED = {
     "track.csv": ("time_s", "x_m", "y_m", "z_m"),
     "fixes.csv": ("time_s", "used"),
     "ranges.csv": ("time_s", "from", "to", "range_m"),
+    "innovations.csv": ("time_s", "rows", "nis"),
 }
 
 
@@ -55,6 +56,11 @@ def read_fixes(path: Path) -> Table | None:
         Where it holds mistakes.
     """
     return _read(path, _NEEDED["fixes.csv"]) if path.exists() else None
+
+
+def read_innovations(path: Path) -> Table | None:
+    """Read the innovations of a run; None where there is no such file. Errors as `read_fixes`."""
+    return _read(path, _NEEDED["innovations.csv"]) if path.exists() else None
 
 
 def by_vehicle(table: Table) -> Iterator[tuple[str, Table]]:

@@ -26,6 +26,7 @@ COLUMNS = {
     "hdop,vdop,hpl_m,vpl_m,heard,used,excluded",
     "track.csv": "time_s,vehicle,x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,yaw_rad,sd_x_m,sd_y_m,sd_z_m,sd_yaw_rad,source",
     "events.csv": "time_s,vehicle,event,detail",
+    "innovations.csv": "time_s,rows,nis",
 }
 
 EXCHANGE_COLUMNS = (
@@ -161,6 +162,9 @@ class RunWriter:
         )
         if step.exchanges and "exchanges.csv" in self._files:
             self._files["exchanges.csv"].add((sync_s, _exchange_row(exchange)) for exchange in step.exchanges)
+        self._files["innovations.csv"].add(
+            (one.time_s, [_time(one.time_s), str(one.rows), _figure(one.nis)]) for one in step.innovations
+        )
         self._files["events.csv"].add((event.time_s, _event_row(event)) for event in step.events)
         for estimate in step.estimates:
             key = f"tum {estimate.vehicle}"

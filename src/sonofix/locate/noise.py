@@ -20,7 +20,10 @@ CLOCK_SPEED_SD = 1e-4
 
 
 @numba.njit(cache=True, error_model="numpy")
-def fill_noise(range_m, covariance_m2, rate_sd_mps, misplaced_m, emitter, rows, dt, speed_sd_mps, clock_sd_mps, out):
+def fill_noise(
+    range_m, covariance_m2, rate_sd_mps, misplaced_m, emitter, rows, dt, speed_sd_mps, clock_sd_mps, agile_mps2,
+    out,
+):  # fmt: skip
     """Fill ``out`` (m, m) as `row_noise` describes it.
 
     Of all rows of an epoch: ``range_m``, their covariance, ``rate_sd_mps`` (empty without rates: m = n), their
@@ -36,7 +39,7 @@ def fill_noise(range_m, covariance_m2, rate_sd_mps, misplaced_m, emitter, rows, 
             # a beacon's misplacement is the same for all who hear it
             if emitter[a] == emitter[b]:
                 out[i, k] += misplaced_m[a] ** 2
-        out[i, i] += (MANOEUVRE_MPS2 * dt[i] ** 2 / 2) ** 2 + (speed_sd_mps * dt[i]) ** 2
+        out[i, i] += (agile_mps2 * dt[i] ** 2 / 2) ** 2 + (speed_sd_mps * dt[i]) ** 2
     if len(out) == n:
         return
     for i in range(n):
@@ -46,7 +49,7 @@ def fill_noise(range_m, covariance_m2, rate_sd_mps, misplaced_m, emitter, rows, 
             out[n + i, n + k] = clock_sd_mps**2
         # a misplaced beacon is seen in another direction, so that its range rate is another part of the velocity
         turned = TYPICAL_SPEED_MPS * misplaced_m[a] / max(abs(range_m[a]), 1.0)
-        out[n + i, n + i] += rate_sd_mps[a] ** 2 + (MANOEUVRE_MPS2 * dt[i]) ** 2 + turned**2
+        out[n + i, n + i] += rate_sd_mps[a] ** 2 + (agile_mps2 * dt[i]) ** 2 + turned**2
 
 
 def row_noise(
@@ -56,6 +59,7 @@ def row_noise(
     dt: Floats,
     speed_sd_mps: float = 0.0,
     clock_sd_mps: float = 0.0,
+    agile_mps2: float = MANOEUVRE_MPS2,
 ) -> Floats:
     """Covariance (m, m) of some rows' ranges in m² and, below, of their range rates in m²/s², where there are any.
 
@@ -67,6 +71,8 @@ def row_noise(
         Deviation of a velocity that is taken as 0.
     clock_sd_mps : float
         Deviation of a clock's drift that is taken as 0.
+    agile_mps2 : float
+        Deviation of the acceleration, of which each row is taken to have another; 0 where it is told of elsewhere.
     """
     if links.emitter_sd_m.any():
         emitter = np.unique(np.array(epoch.emitter), return_inverse=True)[1]
@@ -75,5 +81,5 @@ def row_noise(
     rate_sd = np.zeros(0) if epoch.range_rate_sd_mps is None else epoch.range_rate_sd_mps
     out = np.empty((2 * len(rows),) * 2 if len(rate_sd) else (len(rows),) * 2)
     own = (epoch.range_m, np.ascontiguousarray(epoch.covariance_m2), rate_sd, links.emitter_sd_m, emitter)
-    fill_noise(*own, rows, dt, speed_sd_mps, clock_sd_mps, out)
+    fill_noise(*own, rows, dt, speed_sd_mps, clock_sd_mps, agile_mps2, out)
     return out

@@ -5,12 +5,14 @@ of a run.
 """
 
 from sonofix.score.columns import RangeColumns, TrackColumns, range_columns, track_columns
+from sonofix.score.innovations import InnovationFigures, score_innovations
 from sonofix.score.poses import heard_range_m, node_position_m, pose_at
 from sonofix.score.ranges import ErrorFigures, RangeFigures, score_ranges
 from sonofix.score.track import TrackFigures, score_track
 
 __all__ = [
     "ErrorFigures",
+    "InnovationFigures",
     "RangeColumns",
     "RangeFigures",
     "TrackColumns",
@@ -19,6 +21,7 @@ __all__ = [
     "node_position_m",
     "pose_at",
     "range_columns",
+    "score_innovations",
     "score_ranges",
     "score_track",
     "track_columns",

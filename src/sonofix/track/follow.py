@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import SIZE, Links, link, open_arms, row_times, rows_at, turning
 from sonofix.locate.fix import fix
 from sonofix.locate.noise import CLOCK_SPEED_SD
-from sonofix.records import Estimate, Event, Fix, Floats, RangeEpoch
+from sonofix.records import Estimate, Event, Fix, Floats, Innovation, RangeEpoch
 from sonofix.site import Site
 from sonofix.track import loose, stated
 from sonofix.track.alone import Alone, Silence, apart, unled
@@ -83,6 +83,8 @@ class Follower:
     Attributes
     ----------
     belief : Belief
+    innovation : Innovation or None
+        Of the latest epoch's rows that entered the track; None where none did, or they placed a vehicle.
     refuted : bool (V,)
         Vehicles that are not, or do not head, as they were stated to start: ranges gainsaid it before they bore it out.
     """
@@ -99,6 +101,7 @@ class Follower:
         self.motion = motion or Motion()
         self.free_running = free_running
         self.belief = blank(site, inputs, held)
+        self.innovation: Innovation | None = None
         self._arms = open_arms(site)
         self._refused = np.zeros(len(site.vehicles), int)
         self._heard = np.zeros(len(site.vehicles), bool)
@@ -186,6 +189,7 @@ class Follower:
         links = link(self.site, epoch.emitter, epoch.receiver)
         time_s = self._time(epoch, links)
         events: list[Event] = []
+        self.innovation = None
         loosely = not len(epoch) and any(found.status == "ok" for found in fixes)
         if not self.belief.placed.any() and not self._recent:
             # a recording may begin before its clock's zero
@@ -203,7 +207,7 @@ class Follower:
         taken = self._place(links, fixes, events)
         # ranges that placed a vehicle have had their say
         before = self.belief
-        self.belief, used, _ = update(before, epoch, links, candidates & ~taken)
+        self.belief, used, _, self.innovation = update(before, epoch, links, candidates & ~taken)
         if before.inputs is not None and len(before.inputs.time_s) and before.heeded:
             used = self._slipped(before, epoch, links, candidates & ~taken, used, events, ~self._tried(fixes))
         used |= taken
@@ -297,10 +301,10 @@ class Follower:
             mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
             lift_heading(mean, covariance, free, who)
             opened = replace(opened, mean=mean, covariance=covariance, free=free)
-        opened, again, _ = update(opened, epoch, links, asked, together=False)
+        opened, again, _, innovation = update(opened, epoch, links, asked, together=False)
         if np.count_nonzero(again) <= np.count_nonzero(used):
             return used
-        self.belief = opened
+        self.belief, self.innovation = opened, innovation
         if unproven:
             self._alone = None  # what it gathered was against that heading
         apart = np.hypot(*(self.belief.pose()[who, :2] - before.pose()[who, :2]))
@@ -478,7 +482,7 @@ class Follower:
             if rival.lost and rival.course is not None:
                 self._stated[rival.vehicle] = False
             if likelier:
-                self.belief = follows(self.belief, rival.belief)
+                self.belief, self.innovation = follows(self.belief, rival.belief), None
                 self._refused[rival.vehicle] = 0
                 x, y, z = estimate(self.belief, self.site, rival.vehicle, "fused").position_m
                 text = f"another place is likelier by far: ({x:.3f}, {y:.3f}, {z:.3f}) m"

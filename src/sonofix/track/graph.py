@@ -238,7 +238,9 @@ class Problem:
         if epoch.range_rate_mps is not None:
             measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
         pair = pairs_of(node.belief, epoch, rows)
-        noise, links = noise_of(node.belief, epoch, links, rows, dt, pair), links.rows(rows)
+        whole, links = links, links.rows(rows)
+        derivative = expect(links, node.belief, node.belief.mean, dt, epoch, pair)[1]
+        noise = noise_of(node.belief, epoch, whole, rows, dt, pair, derivative)
         if node.belief.trust is not None and epoch.snr_db is None:
             noise[np.diag_indices(len(rows))] += node.belief.trust.extra(pair)
 

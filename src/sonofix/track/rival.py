@@ -92,7 +92,7 @@ def heard(
     news : float
         By how much it was likelier; 0 while it is not known how large noise is.
     """
-    belief, used, _ = update(predict(belief, max(time_s, belief.time_s), motion), epoch, links, asked)
+    belief, used, *_ = update(predict(belief, max(time_s, belief.time_s), motion), epoch, links, asked)
     trust = belief.trust
     return belief, used, 0.0 if trust is None or trust.count[-1] < HEARD else trust.told - others
 

@@ -274,7 +274,7 @@ def earlier(
                 rows.append(k)
         belief = predict(belief, time_s, passage.follower.motion)
         links = link(site, epoch.emitter, epoch.receiver)
-        belief, _, _ = update(belief, epoch, links, np.isfinite(epoch.range_m))
+        belief, *_ = update(belief, epoch, links, np.isfinite(epoch.range_m))
         own = [SIZE * who + i for who in np.flatnonzero(first.placed) for i in (0, 1)]
         if belief.covariance[own, own].max() > BACK_SD_M**2:
             break

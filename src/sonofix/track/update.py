@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.geometry import SIZE, Links, rows_at
-from sonofix.locate.noise import row_noise
-from sonofix.records import Floats, RangeEpoch
+from sonofix.geometry import PITCH, ROLL, SIZE, YAW, Links, rows_at
+from sonofix.locate.noise import MANOEUVRE_MPS2, row_noise
+from sonofix.records import Floats, Innovation, RangeEpoch
 from sonofix.track import paired, sound_rows, stated
 from sonofix.track.belief import Belief
 from sonofix.track.held import hold
@@ -31,6 +31,9 @@ ASTRAY = 1e-3
 """Ranges are not believed where the state still moves by more when iterations have run out."""
 
 
+MANOEUVRE_RADPS2 = 4.0
+"""Acceleration (one sigma) of each angle within an epoch."""
+
 BENT = 0.1
 """Share of their own errors by which stated ranges may bend within what places are uncertain by, uniterated."""
 
@@ -42,7 +45,7 @@ def update(
     candidates: NDArray[np.bool_],
     iterations: int = 20,
     together: bool = True,
-) -> tuple[Belief, NDArray[np.bool_], Floats]:
+) -> tuple[Belief, NDArray[np.bool_], Floats, Innovation | None]:
     """Correct a belief, already predicted to the epoch's instant, by the epoch's rows.
 
     Parameters
@@ -61,6 +64,8 @@ def update(
     used : bool (n,)
     surprise : float64 (m,)
         Of the m rows asked: squared range innovation over its expected variance, 1 on average where that is true.
+    innovation : Innovation or None
+        Of the rows used, together; None where none was.
     """
     used = np.zeros(len(epoch), bool)
     placed = np.append(belief.placed, True)
@@ -69,19 +74,19 @@ def update(
     if not len(rows) or (clock and not belief.free[-2]):
         if belief.trust is not None:
             belief = replace(belief, trust=replace(belief.trust, told=0.0))
-        return belief, used, np.zeros(0)
+        return belief, used, np.zeros(0), None
     dt = epoch.time_s[rows] - belief.time_s
     pair = pairs_of(belief, epoch, rows)
-    noise = noise_of(belief, epoch, links, rows, dt, pair)
     measured = epoch.range_m[rows]
+    if epoch.range_rate_mps is not None:
+        measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
+    whole, links = links, links.rows(rows)
+    mean = belief.mean if belief.about is None else belief.near(belief.about.now, belief.mean)
+    shown, derivative = expect(links, belief, mean, dt, epoch, pair)
+    noise = noise_of(belief, epoch, whole, rows, dt, pair, derivative)
     trust, claimed = belief.trust if epoch.snr_db is None else None, noise.diagonal().copy()
     if trust is not None:
         noise[np.diag_indices(len(rows))] += trust.extra(pair)
-    if epoch.range_rate_mps is not None:
-        measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
-    links = links.rows(rows)
-    mean = belief.mean if belief.about is None else belief.near(belief.about.now, belief.mean)
-    shown, derivative = expect(links, belief, mean, dt, epoch, pair)
     miss = measured - shown - derivative @ (belief.mean - mean)
     crossed = derivative @ belief.covariance
     spread = np.einsum("ij,ij->i", crossed, derivative) + noise.diagonal()
@@ -110,7 +115,7 @@ def update(
         noise[np.diag_indices(len(rows))] *= larger
         belief = replace(belief, trust=trust)
     if not near.any():
-        return belief, used, surprise
+        return belief, used, surprise, None
     used[rows[near]] = True
     hearing = Hearing(links, dt, measured, noise, pair)
     if not near.all():
@@ -122,13 +127,18 @@ def update(
         iterations = 1
     found = _peak(belief, epoch, hearing, iterations, mean, (miss, derivative, crossed))
     if together and trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
-        after, used[rows[near]] = _sound(belief, epoch, hearing, iterations, mean, found)
-        return after, used, surprise
+        after, used[rows[near]], found = _sound(belief, epoch, hearing, iterations, mean, found)
+        return after, used, surprise, _innovation(belief, found)
     if not found.settled:
         used[:] = False
-        return belief, used, surprise
+        return belief, used, surprise, None
     after = replace(belief, mean=found.mean, covariance=found.covariance(belief.covariance))
-    return after if trust is None else _learn(after, trust, epoch, asked, claimed), used, surprise
+    after = after if trust is None else _learn(after, trust, epoch, asked, claimed)
+    return after, used, surprise, _innovation(belief, found)
+
+
+def _innovation(belief: Belief, found: Peak) -> Innovation | None:
+    return Innovation(belief.time_s, len(found.miss), found.cost) if found.settled else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,8 +192,10 @@ def _peak(
 
 def _sound(
     belief: Belief, epoch: RangeEpoch, hearing: Hearing, iterations: int, mean: Floats, whole: Peak
-) -> tuple[Belief, NDArray[np.bool_]]:
+) -> tuple[Belief, NDArray[np.bool_], Peak]:
     """Correct a belief by rows that cannot all be true; return which of them the likeliest hypothesis believes.
+
+    And where that has its peak.
 
     Where none is likely and rows gainsay each other, all are taken to err by as much as they do (Birge 1932).
     """
@@ -199,17 +211,17 @@ def _sound(
     everything = np.ones(count, bool)
     found = sound_rows.likely(whole, count, belief.covariance, solve, look)
     if not all(one.peak.settled for one in found):
-        return belief, ~everything
+        return belief, ~everything, replace(whole, settled=False)
     if found:
         after, covariance = sound_rows.mixed(found, belief.covariance)
-        return replace(belief, mean=after, covariance=covariance), found[0].kept
+        return replace(belief, mean=after, covariance=covariance), found[0].kept, found[0].peak
     misfit, redundancy = whole.misfit
     if whole.settled and misfit > sound_rows.limit(len(whole.miss)):
         wider = replace(hearing, noise=hearing.noise * (misfit / redundancy))
         whole = _peak(belief, epoch, wider, iterations, mean)
     if not whole.settled:
-        return belief, ~everything
-    return replace(belief, mean=whole.mean, covariance=whole.covariance(belief.covariance)), everything
+        return belief, ~everything, whole
+    return replace(belief, mean=whole.mean, covariance=whole.covariance(belief.covariance)), everything, whole
 
 
 def linear(
@@ -222,10 +234,10 @@ def linear(
     rows = np.flatnonzero(asked)
     dt = epoch.time_s[rows] - belief.time_s
     pair = pairs_of(belief, epoch, rows)
-    variance = noise_of(belief, epoch, links, rows, dt, pair).diagonal()
+    shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
+    variance = noise_of(belief, epoch, links, rows, dt, pair, derivative).diagonal()
     if belief.trust is not None:
         variance = variance + belief.trust.extras(pair)[0]
-    shown, derivative = expect(links.rows(rows), belief, belief.mean, dt, epoch, pair)
     return derivative, epoch.range_m[rows] - shown + derivative @ belief.mean, variance, pair
 
 
@@ -266,13 +278,39 @@ def noise_of(
     rows: NDArray[np.int64],
     dt: Floats,
     pair: NDArray[np.int64],
+    derivative: Floats,
 ) -> Floats:
-    """Covariance of rows as `row_noise` gives it, less what stays with a pair and is followed as a state."""
-    noise = row_noise(epoch, links, rows, dt)
+    """Covariance (m, m) of rows as `row_noise` gives it, less what stays with a pair and is followed as a state.
+
+    ``derivative`` (m, n) is what `expect` told of them. Rows of our own share one acceleration of each vehicle, which
+    each sees from its side and for as long as it was heard from the instant of the state. Ranges of others are weighed
+    one by one, and take it as noise of their own.
+    """
+    others = belief.trust is not None and epoch.snr_db is None
+    noise = row_noise(epoch, links, rows, dt, agile_mps2=MANOEUVRE_MPS2 if others else 0.0)
+    if not others:
+        seen = _accelerated(belief, derivative, dt)
+        noise += seen @ seen.T
     if len(pair):
         at = np.arange(len(rows))
         noise[at, at] -= np.where(pair >= 0, epoch.bias_m2[rows], 0.0)
     return noise
+
+
+def _accelerated(belief: Belief, derivative: Floats, dt: Floats) -> Floats:
+    """Return what each row (m, k) changes by as a vehicle's place or angle is accelerated, by one deviation each.
+
+    At dt an acceleration a has changed the velocity by a dt and the place by a dt² / 2; the derivative by the velocity
+    holds that of the place dt times already.
+    """
+    places = (0, 1, 2, YAW, ROLL, PITCH)
+    at = np.array([SIZE * v + p for v in np.flatnonzero(belief.placed).tolist() for p in places], np.int64)
+    at = at[belief.free[at]]
+    part = at % SIZE
+    rate = at + np.where(part < ROLL, 4, 2)
+    sd = np.where(part < YAW, MANOEUVRE_MPS2, MANOEUVRE_RADPS2)
+    late = np.tile(dt, len(derivative) // len(dt))[:, None]
+    return sd * late * (derivative[:, rate] - derivative[:, at] * late / 2)
 
 
 def _learn(
@@ -314,7 +352,7 @@ def weighed_rows(belief: Belief, epoch: RangeEpoch, links: Links, asked: NDArray
     """
 
     def told(rows: NDArray[np.bool_]) -> float:
-        after, used, _ = update(belief, epoch, links, rows)
+        after, used, *_ = update(belief, epoch, links, rows)
         count = np.count_nonzero(used)
         sound = strangeness(belief, epoch, links, used, after.mean) + count * np.log(2 * np.pi) if count else 0.0
         return stated.STRAY * (np.count_nonzero(asked) - count) - 0.5 * float(sound)
@@ -346,7 +384,8 @@ def strangeness(
     measured = epoch.range_m[rows]
     if epoch.range_rate_mps is not None:
         measured = np.concatenate([measured, epoch.range_rate_mps[rows]])
-    expected = derivative @ belief.covariance @ derivative.T + noise_of(belief, epoch, links, rows, dt, pair)
+    noise = noise_of(belief, epoch, links, rows, dt, pair, derivative)
+    expected = derivative @ belief.covariance @ derivative.T + noise
     if others and belief.trust is not None:
         expected[np.diag_indices(len(rows))] += belief.trust.extra(pair)
     miss = measured - shown - derivative @ (belief.mean - mean)
