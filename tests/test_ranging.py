@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonofix.ranging import RANGES_WITHOUT_SD_M, SWEEP_S, range_epoch, stated_epochs, with_sound_speed
+from sonofix.ranging import JERK_MPS3, RANGES_WITHOUT_SD_M, SWEEP_S, range_epoch, stated_epochs, with_sound_speed
 from sonofix.records import Acquisition, Detection, RangeEpoch, RangeRows
 from sonofix.signals.waveform import waveforms_of
 from sonofix.site import Site
@@ -71,7 +71,14 @@ def test_receding_is_positive() -> None:
     """A burst that is heard slowly, time scale below 1, comes from a source that recedes."""
     epoch = epoch_of(site_of(), heard("A", "M", 2.02, 1 - 1.7 / SPEED), heard("B", "M", 2.03, 1 + 0.34 / SPEED))
     assert epoch.range_rate_mps == pytest.approx([1.7, -0.34])
-    assert epoch.range_rate_sd_mps == pytest.approx(SPEED * np.array([3e-6, 3e-6]))
+    bent = JERK_MPS3 * (2 * HALF_S) ** 2 / 40
+    assert epoch.range_rate_sd_mps == pytest.approx(np.hypot(SPEED * np.array([3e-6, 3e-6]), bent))
+
+
+def test_a_cubic_way_tilts_its_parabola_by_a_fortieth_of_jerk_and_duration_squared() -> None:
+    t = np.linspace(-HALF_S, HALF_S, 20001)
+    tilt = np.polynomial.polynomial.polyfit(t, JERK_MPS3 * t**3 / 6, 2)[1]
+    assert tilt == pytest.approx(JERK_MPS3 * (2 * HALF_S) ** 2 / 40, rel=1e-3)
 
 
 def test_rows_come_in_order_of_arrival() -> None:

@@ -69,6 +69,10 @@ class Links:
         """What the kernels take."""
         return self.emitter_vehicle, self.emitter_point, self.receiver_vehicle, self.receiver_point
 
+    def touch(self, vehicle: int) -> NDArray[np.bool_]:
+        """Return which rows have an end on a vehicle (n,)."""
+        return (self.emitter_vehicle == vehicle) | (self.receiver_vehicle == vehicle)
+
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.int64]) -> Links:
         """Return some of the rows."""
         return Links(

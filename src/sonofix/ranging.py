@@ -21,6 +21,9 @@ TIMES_SD = 0.01
 """Share by which times of flight that others state may all be too long, where a thermometer made ranges of them: air
 along the way that is not the thermometer's, and a clock that nobody checked."""
 
+JERK_MPS3 = 2.0
+"""How fast a range acceleration may change within a burst, one sigma: a straight pass at 2.1 m/s, 2 m away, does at most."""
+
 SWEEP_S = 1.0
 """Stated ranges are gathered into epochs no longer than this."""
 
@@ -35,7 +38,8 @@ def range_epoch(
     """Ranges of what was heard in one epoch, in order of arrival.
 
     What the site states of a pair's bias is taken off. ``covariance_m2`` holds each range's own variance, that bias's
-    doubt, and what all share: the sound speed's error, in proportion.
+    doubt, and what all share: the sound speed's error, in proportion. ``range_rate_sd_mps`` allows for a range
+    acceleration that changes within the burst (`JERK_MPS3`).
     """
     heard = sorted(acquired.detections, key=lambda d: d.arrival_s)
     beacons = [site.beacon(d.emitter) for d in heard]
@@ -48,7 +52,9 @@ def range_epoch(
     range_m = sound_speed_mps * (time_s - sent_s) - bias_m
     own = np.array([d.covariance[0, 0] for d in heard]) * sound_speed_mps**2 + bias_sd_m**2
     rate = sound_speed_mps * (1.0 - np.array([d.time_scale for d in heard]))
-    rate_sd = sound_speed_mps * np.sqrt([d.covariance[1, 1] for d in heard])
+    # a burst is fitted as a parabola: what is cubic in it, j t³ / 6, tilts that by j T² / 40 (least squares over T)
+    bent_mps = JERK_MPS3 * np.array([waveforms[d.emitter].duration_s for d in heard]) ** 2 / 40
+    rate_sd = np.hypot(sound_speed_mps * np.sqrt([d.covariance[1, 1] for d in heard]), bent_mps)
     common_clock = not site.clock_known
     flight_m = flights_m(range_m, common_clock)
     shared = (sound_speed_sd_mps / sound_speed_mps) ** 2 * np.outer(flight_m, flight_m)

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, Links, link, open_arms, row_times, rows_at, turning
-from sonofix.locate.fix import fix
-from sonofix.locate.noise import CLOCK_SPEED_SD
 from sonofix.records import Estimate, Event, Fix, Floats, Innovation, RangeEpoch
 from sonofix.site import Site
 from sonofix.track import loose, stated
+from sonofix.track.agility import Agility
 from sonofix.track.alone import Alone, Silence, apart, unled
 from sonofix.track.bank import Bank
 from sonofix.track.belief import (
@@ -22,22 +21,23 @@ from sonofix.track.belief import (
     Motion,
     blank,
     estimate,
-    lift_heading,
     loosen,
     place,
     predict,
-    reopen,
     set_out,
     start_at,
     unplaced,
 )
+from sonofix.track.clock import opened
 from sonofix.track.course import Course
 from sonofix.track.held import hold
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
+from sonofix.track.recent import Recent
 from sonofix.track.rest import Rest
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, begun, beside, follows, image
-from sonofix.track.update import linear, strangeness, update, weighed_rows
+from sonofix.track.slip import slipped
+from sonofix.track.update import linear, update
 from sonofix.track.wheels import AS_EXPECTED
 
 PATIENCE = 3
@@ -47,23 +47,8 @@ CONTRADICTED = 30.0
 """Squared distance of a fix from the track, over its expected value per axis, at which the fix is followed at once:
 noise alone comes there once in three million epochs."""
 
-AGILITY_RATE = 0.1
-"""How fast the density of acceleration follows, per epoch."""
-
-AGILITY = (1e-3, 2.0)
-"""Least and most that it may become, in m²/s³."""
-
-SLIPPED_M = 1.0
-"""How far aside a vehicle may be found at once that was pushed, one sigma per axis."""
-
-SLIPS = float(np.log(1e-3))
-"""Logarithm of how likely a slip is in an epoch."""
-
 FORGOTTEN_M = 1e4
 """Deviation at which nothing is left of a place: after an hour of silence, or where the clock was set."""
-
-GATHER_S = 5.0
-"""Where single epochs are too poor for a fix, ranges of this long are gathered for one."""
 
 
 class Follower:
@@ -105,16 +90,15 @@ class Follower:
         self._arms = open_arms(site)
         self._refused = np.zeros(len(site.vehicles), int)
         self._heard = np.zeros(len(site.vehicles), bool)
-        self._recent: list[RangeEpoch] = []
+        self._recent = Recent(site)
         self._lag_s = 0.0
         self._rival: Rival | None = None
         self._looked_s = -np.inf
-        self._pushed: Floats | None = None
+        self._agility = Agility()
         self._begun_s = np.full(len(site.vehicles), -np.inf)
         self._given = np.zeros(len(site.vehicles), bool)
         self._stated = np.zeros(len(site.vehicles), bool)
         self._mirrored = np.zeros(len(site.vehicles), bool)
-        self._since_s = np.inf
         self.refuted = np.zeros(len(site.vehicles), bool)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
@@ -191,7 +175,7 @@ class Follower:
         events: list[Event] = []
         self.innovation = None
         loosely = not len(epoch) and any(found.status == "ok" for found in fixes)
-        if not self.belief.placed.any() and not self._recent:
+        if not self.belief.placed.any() and not len(self._recent):
             # a recording may begin before its clock's zero
             self.belief = replace(self.belief, time_s=min(self.belief.time_s, time_s))
         self.belief = predict(self.belief, max(time_s, self.belief.time_s), self.motion)
@@ -202,20 +186,26 @@ class Follower:
                 candidates &= found.used | np.isnan(found.residual_m)
         if loosely:
             return self._stand(links, fixes, events), np.zeros(0, bool), tuple(events)
-        self._clock(epoch, fixes)
-        self._gather(epoch)
+        self.belief = opened(self.belief, epoch, fixes, self.free_running)
+        self._recent.take(epoch)
         taken = self._place(links, fixes, events)
         # ranges that placed a vehicle have had their say
         before = self.belief
         self.belief, used, _, self.innovation = update(before, epoch, links, candidates & ~taken)
         if before.inputs is not None and len(before.inputs.time_s) and before.heeded:
-            used = self._slipped(before, epoch, links, candidates & ~taken, used, events, ~self._tried(fixes))
+            asked, asked_of = candidates & ~taken, ~self._tried(fixes)
+            slip = slipped(before, self.site, epoch, links, asked, used, asked_of, self._stated)
+            if slip is not None:
+                self.belief, used, self.innovation = slip.belief, slip.used, slip.innovation
+                events.append(slip.event)
+                if self._stated[slip.vehicle]:
+                    self._alone = None  # what it gathered was against the heading that was stated
         used |= taken
         if taken.any() or any(event.event in ("slip", "reset") for event in events):
             # a rival knows nothing of that
             self._rival, self._undecided[:] = None, False
         self._try_start(fixes)
-        self._loosen(before)
+        self.motion = self._agility.take(before, self.belief, self.motion)
         used = self._contest(epoch, links, candidates, used, events)
         self._heed(epoch, links, candidates & ~taken, events)
         if self.belief.heeded:
@@ -261,57 +251,6 @@ class Follower:
         self._lag_s = time_s - epoch.sync_s
         return time_s
 
-    def _slipped(
-        self,
-        before: Belief,
-        epoch: RangeEpoch,
-        links: Links,
-        asked: NDArray[np.bool_],
-        used: NDArray[np.bool_],
-        events: list[Event],
-        asked_of: NDArray[np.bool_],
-    ) -> NDArray[np.bool_]:
-        """Find the vehicle that moved unnoticed by its own sensors, where many ranges are refused.
-
-        It is the one of those ``asked_of`` (V,) whose place, once opened, makes the epoch as a whole most likely; the
-        epoch is then taken in anew. Ranges that others state may as well be outliers: a slip must be the likelier.
-        Returns the rows used.
-        """
-        refused = asked & ~used
-        best: tuple[float, int, Belief] | None = None
-        for who in np.flatnonzero(before.placed & asked_of).tolist():
-            own = asked & self._touches(links, who)
-            if np.count_nonzero(refused & own) < max(2, np.count_nonzero(own) / 2):
-                continue
-            opened = reopen(before, who, SLIPPED_M)
-            odds = strangeness(opened, epoch, links, asked)
-            if best is None or odds < best[0]:
-                best = odds, who, opened
-        if best is None:
-            return used
-        _, who, opened = best
-        if before.trust is not None:
-            stays = weighed_rows(before, epoch, links, asked)
-            moved = weighed_rows(opened, epoch, links, asked)
-            if moved + SLIPS < stays:
-                return used
-        inputs, unproven = before.inputs, bool(self._stated[who])
-        if unproven and inputs is not None and inputs.wheel_slot[who] >= 0 and not turning(self.site)[who]:
-            # it may not head as was stated; the way driven will tell
-            mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
-            lift_heading(mean, covariance, free, who)
-            opened = replace(opened, mean=mean, covariance=covariance, free=free)
-        opened, again, _, innovation = update(opened, epoch, links, asked, together=False)
-        if np.count_nonzero(again) <= np.count_nonzero(used):
-            return used
-        self.belief, self.innovation = opened, innovation
-        if unproven:
-            self._alone = None  # what it gathered was against that heading
-        apart = np.hypot(*(self.belief.pose()[who, :2] - before.pose()[who, :2]))
-        text = f"{np.count_nonzero(refused)} ranges disagreed: {apart:.2f} m from where its own sensors had it"
-        events.append(Event(before.time_s, self.site.vehicles[who].id, "slip", text))
-        return again
-
     def _forget(self, events: list[Event]) -> None:
         """Let vehicles begin anew of whose place nothing is known any more."""
         for who in np.flatnonzero(self.belief.placed).tolist():
@@ -351,43 +290,6 @@ class Follower:
                 # a heading is borne out by sensors that it makes right (`_heed`)
                 self._given[who], self._stated[who] = False, self._judges_sensors
 
-    def _clock(self, epoch: RangeEpoch, fixes: tuple[Fix, ...]) -> None:
-        """Open the clock offset anew where nothing ties it to the last epoch's: a free-running source, or a start."""
-        belief = self.belief
-        unknown = epoch.clock == "common" and (self.free_running or not belief.free[-2])
-        if not (unknown and len(epoch) and belief.placed.any()):
-            return
-        known = [f.clock_offset_m for f in fixes if f.clock_offset_m is not None]
-        mean, covariance, free = belief.mean.copy(), belief.covariance.copy(), belief.free.copy()
-        mean[-2] = known[0] if known else float(np.median(epoch.range_m))
-        mean[-1] = 0.0
-        covariance[-2:, :] = covariance[:, -2:] = 0.0
-        covariance[-2, -2] = 100.0**2
-        covariance[-1, -1] = (CLOCK_SPEED_SD * epoch.sound_speed_mps) ** 2
-        free[-2:] = True
-        hold(covariance, belief.held, free)
-        self.belief = replace(belief, mean=mean, covariance=covariance, free=free)
-
-    def _loosen(self, before: Belief) -> None:
-        """Let vehicles be as agile as their track shows, where ranges are stated by others and nothing else tells.
-
-        Corrections of velocity that follow each other agree in direction where motion is taken as too calm, and
-        oppose each other where it is taken as too free (Mehra 1970: innovations of an optimal filter are white).
-        """
-        inputs = before.inputs
-        if before.trust is None or before.trust.sizes is not None:
-            return
-        if inputs is None or len(inputs.time_s) or not before.placed.any():
-            return
-        now = (self.belief.pose() - before.pose())[before.placed, 4:6].ravel()
-        last, self._pushed = self._pushed, now
-        size = float(np.linalg.norm(now))
-        if last is None or last.shape != now.shape or size * float(np.linalg.norm(last)) == 0.0:
-            return
-        agree = float(now @ last) / (size * float(np.linalg.norm(last)))
-        psd = self.motion.acceleration_psd * float(np.exp(AGILITY_RATE * agree))
-        self.motion = replace(self.motion, acceleration_psd=float(np.clip(psd, *AGILITY)))
-
     def _doubt_wheels(
         self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]
     ) -> None:
@@ -418,7 +320,7 @@ class Follower:
         if self._alone is not None and self._alone.lost:
             self._alone, self._stated[0] = unled(self.belief, bool(turning(self.site)[0])), False
         elif self._alone is None:
-            self._alone = apart(self.belief, self._gathered(self.site.vehicles[0].id), self._arms[0])
+            self._alone = apart(self.belief, self._recent.fix(self.site.vehicles[0].id, self.belief), self._arms[0])
         elif self._alone.won:
             self.belief = follows(self.belief, self._alone.belief)
             self._alone, self._rival, self._refused[0], self._undecided[0] = None, None, 0, False
@@ -491,8 +393,8 @@ class Follower:
         elif self.belief.time_s - self._looked_s >= ASKED_S:
             self._looked_s = self.belief.time_s
             for who in np.flatnonzero(self.belief.placed).tolist():
-                if self._rival is None and np.any(self._touches(links, who)):
-                    found = self._gathered(self.site.vehicles[who].id)
+                if self._rival is None and np.any(links.touch(who)):
+                    found = self._recent.fix(self.site.vehicles[who].id, self.belief)
                     young = self.belief.time_s - self._begun_s[who] < TRIED_S
                     mirrored = image(self.belief.mean[SIZE * who :][:3], self.belief.free, who, links, found)
                     for other in (found, mirrored)[: 1 + young]:
@@ -536,11 +438,6 @@ class Follower:
         inputs = self.belief.inputs
         return inputs is not None and inputs.bias_slot >= 0
 
-    def _gather(self, epoch: RangeEpoch) -> None:
-        if len(epoch):
-            self._since_s = min(self._since_s, epoch.sync_s)
-            self._recent = [e for e in self._recent if epoch.sync_s - e.sync_s < GATHER_S] + [epoch]
-
     def _place(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> NDArray[np.bool_]:
         """Give positions to vehicles that have none, or whose track refuses what is heard; return the rows that did."""
         taken = np.zeros(len(links), bool)
@@ -551,8 +448,8 @@ class Follower:
             start = found
             again = lost and self._corrected
             poor = found.status in ("too-few", "ambiguous") and not self.free_running
-            if (poor or again) and np.any(self._touches(links, who)):
-                start = self._gathered(found.vehicle)
+            if (poor or again) and np.any(links.touch(who)):
+                start = self._recent.fix(found.vehicle, self.belief)
             two = None if lost else self._twofold(who, start, links)
             if two is not None:
                 start = two[int(self._mirrored[who])]
@@ -569,7 +466,7 @@ class Follower:
                 if self._corrected and start is found:
                     taken |= start.used  # with errors open, the very same ranges would only blur their fix
             else:
-                taken |= start.used if start is found else self._touches(links, who)
+                taken |= start.used if start is found else links.touch(who)
             if two is not None:
                 other = two[1 - int(self._mirrored[who])]
                 self._rival = begun(self.belief, who, other, self._arms[who], Course())
@@ -589,9 +486,7 @@ class Follower:
             return None
         if place_m is None or self.site.vehicles[who].z_m is None or inputs.wheel_slot[who] < 0:
             return None
-        heard = {pair for epoch in self._recent for pair in zip(epoch.emitter, epoch.receiver, strict=True)}
-        early = self._recent[-1].sync_s < self._since_s + GATHER_S
-        if turning(self.site)[who] or (early and len(heard) < len(inputs.pairs)):
+        if turning(self.site)[who] or (self._recent.early and self._recent.pairs < len(inputs.pairs)):
             return None  # others may yet be heard
         one = replace(found, status="ok", position_m=place_m, covariance=np.eye(2), states=("x", "y"))
         other = image(place_m, self.belief.free, who, links, one)
@@ -612,37 +507,6 @@ class Follower:
         squared = yy * apart[0] ** 2 - 2 * xy * apart[0] * apart[1] + xx * apart[1] ** 2
         return bool(squared > CONTRADICTED * (xx * yy - xy**2))
 
-    def _gathered(self, vehicle: str) -> Fix:
-        """Return a fix from the latest range of each pair within some seconds."""
-        latest: dict[tuple[str, str], tuple[RangeEpoch, int]] = {}
-        for epoch in self._recent:
-            for i, pair in enumerate(zip(epoch.emitter, epoch.receiver, strict=True)):
-                latest[pair] = (epoch, i)
-        last = self._recent[-1]
-        chosen = list(latest.values())
-        merged = replace(
-            last,
-            emitter=tuple(pair[0] for pair in latest),
-            receiver=tuple(pair[1] for pair in latest),
-            time_s=np.array([e.time_s[i] for e, i in chosen]),
-            range_m=np.array([e.range_m[i] for e, i in chosen]),
-            covariance_m2=np.diag([e.covariance_m2[i, i] for e, i in chosen]),
-            range_rate_mps=None,
-            range_rate_sd_mps=None,
-            snr_db=None,
-        )
-        if self._corrected and self.belief.inputs is not None:
-            scale, bias_m = self.belief.mean[self.belief.inputs.range_slot :][:2]
-            merged = replace(merged, range_m=(merged.range_m - bias_m) / (1.0 + scale))
-            if self.belief.trust is not None:
-                numbers = np.array([self.belief.inputs.pairs[pair] for pair in latest])
-                own_m2 = self.belief.trust.extra(numbers) + self.belief.trust.variance[:, numbers].sum(axis=0)
-                merged = replace(merged, covariance_m2=merged.covariance_m2 + np.diag(own_m2))
-        return fix(merged, self.site, vehicle)
-
-    def _touches(self, links: Links, who: int) -> NDArray[np.bool_]:
-        return (links.emitter_vehicle == who) | (links.receiver_vehicle == who)
-
     def _judge(
         self,
         epoch: RangeEpoch,
@@ -653,7 +517,7 @@ class Follower:
     ) -> None:
         """Count refusals; tell when a vehicle falls silent, is heard again, or a range was left out."""
         for who, vehicle in enumerate(self.site.vehicles):
-            touching = self._touches(links, who)
+            touching = links.touch(who)
             asked, believed = np.count_nonzero(touching), np.count_nonzero(used & touching)
             heard = believed > 0
             if self.belief.placed[who]:
@@ -675,7 +539,7 @@ class Follower:
     def _estimates(self, links: Links, used: NDArray[np.bool_]) -> tuple[Estimate, ...]:
         out = []
         for who in np.flatnonzero(self.belief.placed & ~self._undecided):
-            entered = bool((used & self._touches(links, int(who))).any())
+            entered = bool((used & links.touch(int(who))).any())
             out.append(estimate(self.belief, self.site, int(who), "fused" if entered else "predicted"))
         return tuple(out)
 

@@ -18,9 +18,10 @@ from sonofix.geometry import POSE, link
 from sonofix.records import Estimate, Floats
 from sonofix.track import steps, wheels
 from sonofix.track.belief import SIZE, Belief, predict
-from sonofix.track.follow import SLIPPED_M, Follower
+from sonofix.track.follow import Follower
 from sonofix.track.inputs import COMPASS, STEP, WHEELS
 from sonofix.track.passage import YAW, Heard, Mark, Passage
+from sonofix.track.slip import SLIPPED_M
 from sonofix.track.smooth import PASSES, settle, track
 from sonofix.track.update import expect, noise_of, pairs_of
 
