@@ -22,7 +22,7 @@ TIMES_SD = 0.01
 along the way that is not the thermometer's, and a clock that nobody checked."""
 
 JERK_MPS3 = 2.0
-"""How fast a range acceleration may change within a burst, one sigma: a straight pass at 2.1 m/s, 2 m away, does at most."""
+"""How fast a range acceleration may change within a burst, one sigma: as a straight pass at 2.1 m/s, 2 m away."""
 
 SWEEP_S = 1.0
 """Stated ranges are gathered into epochs no longer than this."""
