@@ -381,7 +381,10 @@ class Site(_Section):
         for kind, rows in kinds.items():
             yield from _twice(kind, rows, "id", f"every {kind} needs its own id")
         yield from _twice("microphone", kinds["microphone"], "channel", "two microphones cannot share a channel")
-        if isinstance(get("beacon") or get("beacons"), list | tuple | None) and not kinds["beacon"]:
+        # vehicles alone may be followed by positions that others computed
+        positioned = kinds["vehicle"] and not kinds["microphone"]
+        none = isinstance(get("beacon") or get("beacons"), list | tuple | None) and not kinds["beacon"]
+        if none and not positioned:
             yield ("beacon",), None, "nothing sends; add at least one [[beacon]]"
         vehicles = sorted(str(row("id")) for row in kinds["vehicle"])
         for kind in ("beacon", "microphone"):

@@ -109,6 +109,7 @@ def run_folder(
     """
     from sonofix import files, flow
     from sonofix.cli.tally import Tally
+    from sonofix.files.oddities import unused
 
     recording = files.read_recording(folder, to_run=True)
     truths = files.read_truth(folder)
@@ -144,6 +145,8 @@ def run_folder(
     if not tally.epochs:
         raise ValueError(f"{folder}: holds no whole epoch{_length(recording)}; record at least one burst to its end")
     _summarise(folder, out, tally, scored=bool(truths))
+    for line in unused(recording):
+        speaker().print(f"Note: {line}")
     if plot:
         _draw(picture, recording, sample.steps(), truths)
     speaker().print(f"Written to {out}")

@@ -28,10 +28,26 @@ def oddities(
     sentences = [*_places(site), *_schedule(site, references), *_air(site), *_chips(site)]
     if figures is not None:
         sentences += [*_samples(recording, figures), *_sync(recording, figures)]
-    sentences += _sensors(recording, figures)
+    sentences += [*_sensors(recording, figures), *unused(recording)]
     if not has_truth:
         sentences.append("there is no truth.csv, so errors cannot be told")
     return sentences
+
+
+def unused(recording: Recording) -> Iterator[str]:
+    """Tell positions that are not used, since what is there beside them says more."""
+    if "positions" not in recording.tables:
+        return
+    heard = "the capture" if recording.blocks is not None else "ranges.csv"
+    if recording.blocks is None and recording.ranges is None:
+        if "exchanges" not in recording.tables:
+            return
+        heard = "exchanges.csv"
+    yield (
+        f"positions.csv is not used: the track is made of {heard}, whose ranges say more than positions made of "
+        "ranges; to follow the positions instead, put them into a folder of their own, with site.toml and the tables "
+        "of the vehicles' sensors"
+    )
 
 
 def stray_files(folder: Path) -> list[str]:
@@ -192,6 +208,9 @@ def _sensors(recording: Recording, figures: CaptureFigures | None) -> Iterator[s
         first_s, last_s = 0.0, figures.sample_count / recording.rate_hz
     elif recording.ranges is not None:
         first_s, last_s = float(recording.ranges.time_s.min()), float(recording.ranges.time_s.max())
+    elif "positions" in recording.tables and "exchanges" not in recording.tables:
+        told_s = recording.tables["positions"].columns["time_s"]
+        first_s, last_s = float(told_s.min()), float(told_s.max())
     else:
         return
     for stem in ("odometry", "steps", "compass", "imu"):

@@ -50,6 +50,10 @@ class Alone:
     ) -> Alone:
         """Follow an epoch of which the track made the log likelihood ``others``."""
         belief, _, news = heard(self.belief, time_s, motion, epoch, links, asked, others)
+        return self.told(belief, news)
+
+    def told(self, belief: Belief, news: float) -> Alone:
+        """Go on with a belief to which what came was likelier than to the track by ``news``, as a logarithm."""
         return Alone(belief, max(self.ahead + news, 0.0), self.sum + news)
 
     @property

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sonofix.geometry import SIZE, Links, link, open_arms, row_times, rows_at, turning
 from sonofix.records import Estimate, Event, Fix, Floats, Innovation, RangeEpoch
 from sonofix.site import Site
-from sonofix.track import loose, stated
+from sonofix.track import stated
 from sonofix.track.agility import Agility
 from sonofix.track.alone import Alone, Silence, apart, unled
 from sonofix.track.bank import Bank
@@ -33,6 +33,7 @@ from sonofix.track.course import Course
 from sonofix.track.held import hold
 from sonofix.track.inputs import Inputs
 from sonofix.track.panel import MOST_PAIRS, ROUGH_M, Panel
+from sonofix.track.positions import Positions
 from sonofix.track.recent import Recent
 from sonofix.track.rest import Rest
 from sonofix.track.rival import ASKED_S, TRIED_S, Rival, begun, beside, follows, image
@@ -112,6 +113,7 @@ class Follower:
         self._alone: Alone | None = None
         self._silence = Silence()
         self._rest = Rest(site)
+        self._positions = Positions(site, inputs is not None and len(inputs.time_s) > 0)
 
     def copied(self) -> Follower:
         """Return a follower that is as this one is now, and goes its own way from here."""
@@ -124,6 +126,7 @@ class Follower:
         are those of one of `likely` instead.
         """
         trust, inputs = other.belief.trust, self.belief.inputs
+        self._positions.knowing(other._positions)
         if trust is None or inputs is None:
             return self
         motion = other.motion
@@ -185,7 +188,7 @@ class Follower:
             if found.status == "ok":
                 candidates &= found.used | np.isnan(found.residual_m)
         if loosely:
-            return self._stand(links, fixes, events), np.zeros(0, bool), tuple(events)
+            return self._stand(fixes, events), np.zeros(0, bool), tuple(events)
         self.belief = opened(self.belief, epoch, fixes, self.free_running)
         self._recent.take(epoch)
         taken = self._place(links, fixes, events)
@@ -217,24 +220,17 @@ class Follower:
         self._prove_start(fixes, events)
         return self._estimates(links, used), used, tuple(events)
 
-    def _stand(self, links: Links, fixes: tuple[Fix, ...], events: list[Event]) -> tuple[Estimate, ...]:
+    def _stand(self, fixes: tuple[Fix, ...], events: list[Event]) -> tuple[Estimate, ...]:
         """Take in positions that others computed; return estimates."""
-        self._place(links, fixes, events)
-        anew = {event.vehicle for event in events if event.event in ("start", "reset")}
-        entered = np.array([vehicle.id in anew for vehicle in self.site.vehicles], bool)
-        for who, found in enumerate(fixes):
-            if found.status != "ok" or entered[who]:
-                continue
-            self.belief, off = loose.take(self.belief, who, found)
-            entered[who] = off <= loose.UNLIKELY
-            self._refused[who] = 0 if entered[who] else self._refused[who] + 1
-            if not entered[who]:
-                text = f"a position {off:.1f} deviations from the track: not believed"
-                events.append(Event(self.belief.time_s, found.vehicle, "excluded", text))
+        self.belief, entered, told = self._positions.take(self.belief, self.motion, fixes, self._stated.tolist())
+        events += told
+        self._undecided = self._given & self._positions.contested
+        self._stated &= ~self._positions.borne_out
+        self._prove_start(fixes, events)
         self.belief = set_out(self._course.head(self.belief))
         events += self._rest.take(self.belief)
-        placed = np.flatnonzero(self.belief.placed).tolist()
-        return tuple(estimate(self.belief, self.site, who, "fused" if entered[who] else "predicted") for who in placed)
+        shown = np.flatnonzero(self.belief.placed & ~self._undecided).tolist()
+        return tuple(estimate(self.belief, self.site, who, "fused" if entered[who] else "predicted") for who in shown)
 
     def time_of(self, epoch: RangeEpoch) -> float:
         """Return the instant an epoch's state will belong to."""
@@ -288,7 +284,8 @@ class Follower:
                 self.refuted[who], self._stated[who], self._given[who] = True, False, False
             elif name in fixed and not self._undecided[who]:
                 # a heading is borne out by sensors that it makes right (`_heed`)
-                self._given[who], self._stated[who] = False, self._judges_sensors
+                judged = self._judges_sensors or (self._positions.judges and not self._positions.borne_out[who])
+                self._given[who], self._stated[who] = False, judged
 
     def _doubt_wheels(
         self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]

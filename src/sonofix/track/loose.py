@@ -1,4 +1,4 @@
-"""Positions that others computed, loosely coupled: each corrects where its vehicle is, and is believed as it is stated.
+"""Positions that others computed, loosely coupled: each corrects where its vehicle is, as far as it is believed.
 
 What they were made of is not known here: a fix that is wrong is refused as a whole, and none of it helps where it lacks
 one range (docs/track.md).
@@ -6,22 +6,61 @@ one range (docs/track.md).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sonofix.geometry import SIZE
+from sonofix.geometry import POSE, SIZE
 from sonofix.records import Fix
-from sonofix.track.belief import Belief
+from sonofix.track.belief import Belief, Motion, place, predict
 from sonofix.track.kernel import joseph
+from sonofix.track.rival import bare
+from sonofix.track.scatter import Scatter
 
 UNLIKELY = 4.0
 """Distance of a position from the track, in deviations, beyond which it is not believed: noise alone comes
 there three times in ten thousand, and one that is left out costs little."""
 
+SPEED_SD_MPS = 3.0
+"""Of a vehicle that positions have just placed, each axis, where its site states no ``max_speed_mps``."""
 
-def take(belief: Belief, vehicle: int, fix: Fix) -> tuple[Belief, float]:
-    """Correct where a vehicle is by a fix of that instant, if it is believed; return by how many deviations it is off.
+JUMPS = float(np.log(1e-3))
+"""Logarithm of how likely it is that a position far off is no outlier: the vehicle is there at once."""
+
+DECIDED = 7.0
+"""Difference of log likelihoods at which one of two places is dropped: odds of a thousand to one."""
+
+AGREEING = 3
+"""Positions that another place takes at least: an outlier may come twice."""
+
+TRIED = 10
+"""Positions after which a place that has not won is dropped."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Taken:
+    """What a position did: the belief and what is known of noise after it, and how it lay.
+
+    ``told`` is the logarithm of how likely the position was before, over that of one that may be anything; ``free`` the
+    same to the members of `Scatter`, 0 where a vehicle's sensors lead it. ``off`` is by how many deviations and
+    ``off_m`` by how many metres it is off.
+    """
+
+    belief: Belief
+    scatter: Scatter
+    told: float
+    free: float
+    off: float
+    off_m: float
+
+    @property
+    def believed(self) -> bool:
+        """Whether it entered."""
+        return self.off <= UNLIKELY
+
+
+def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
+    """Learn from a fix of that instant how far such fixes err, and correct where a vehicle is by it, if it is believed.
 
     The track follows the vehicle's origin, of which a fix tells.
     """
@@ -32,12 +71,117 @@ def take(belief: Belief, vehicle: int, fix: Fix) -> tuple[Belief, float]:
     rows = [fix.states.index("xyz"[i]) for i in axes]
     miss = (fix.position_m - belief.mean[at : at + 3])[axes]
     derivative = np.eye(n)[[at + i for i in axes]]
-    noise = fix.covariance[np.ix_(rows, rows)]
+    stated = fix.covariance[np.ix_(rows, rows)]
     crossed = derivative @ belief.covariance
-    expected = crossed @ derivative.T + noise
-    off = float(np.sqrt(miss @ np.linalg.solve(expected, miss)))
-    if off > UNLIKELY:
-        return belief, off
-    gain = np.linalg.solve(expected, crossed).T
-    covariance = joseph(belief.covariance, gain, derivative, noise)
-    return replace(belief, mean=belief.mean + gain @ miss, covariance=covariance), off
+    spread = crossed @ derivative.T
+    judged, told = scatter.judged(miss, spread, stated)
+    if scatter.state is None:  # it was placed by its stated start
+        scatter, free = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), SPEED_SD_MPS), 0.0
+    else:
+        scatter, free = scatter.taken(belief.time_s, fix.position_m[:2], _level_m2(fix))
+    if led(belief, vehicle):
+        # the members hear no sensor, and tell less
+        scatter, free = replace(scatter, heard=judged.heard), 0.0
+    noise = scatter.scale**2 * stated
+    off = float(np.sqrt(miss @ np.linalg.solve(spread + noise, miss)))
+    off_m = float(np.linalg.norm(miss))
+    if off <= UNLIKELY:
+        gain = np.linalg.solve(spread + noise, crossed).T
+        covariance = joseph(belief.covariance, gain, derivative, noise)
+        belief = replace(belief, mean=belief.mean + gain @ miss, covariance=covariance)
+    return Taken(belief, scatter, told, free, off, off_m)
+
+
+def _level_m2(fix: Fix) -> float:
+    """Variance of x and y that a fix states, in the mean."""
+    assert fix.covariance is not None
+    return float(np.mean([fix.covariance[i, i] for i, name in enumerate(fix.states) if name in ("x", "y")]))
+
+
+def led(belief: Belief, vehicle: int) -> bool:
+    """Whether wheels or steps lead a vehicle from position to position."""
+    inputs = belief.inputs
+    if inputs is None or not belief.heeded:
+        return False
+    wheel, step = int(inputs.wheel_slot[vehicle]), int(inputs.step_slot[vehicle])
+    # an arc needs the heading that its anchor had
+    return (wheel >= 0 and bool(belief.free[wheel + 2])) or (step >= 0 and bool(belief.free[step]))
+
+
+def put(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix, speed_sd_mps: float) -> tuple[Belief, Scatter]:
+    """Put a vehicle where a fix says, moving anyhow, and forget what was believed of it."""
+    assert fix.position_m is not None
+    assert fix.covariance is not None
+    wider = replace(fix, covariance=scatter.scale**2 * fix.covariance)
+    belief = place(belief, vehicle, wider, np.zeros(2))
+    covariance, at = belief.covariance.copy(), SIZE * vehicle + 4
+    covariance[at, at] = covariance[at + 1, at + 1] = speed_sd_mps**2
+    scatter = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), speed_sd_mps)
+    return replace(belief, covariance=covariance), scatter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Elsewhere:
+    """Another place that positions put a vehicle, by themselves: what a track believes that hears no sensor.
+
+    ``ahead`` is by how much it is likelier than the track, of ``count`` positions; ``follows``: it took the last one.
+    """
+
+    belief: Belief
+    scatter: Scatter
+    ahead: float
+    count: int = 1
+    follows: bool = True
+
+    @classmethod
+    def begun(cls, track: Taken, known: Scatter, vehicle: int, fix: Fix, speed_sd_mps: float) -> Elsewhere:
+        """Begin where a fix puts a vehicle that the track did not take; ``known`` is how such fixes erred before."""
+        begun = put(bare(replace(track.belief, heeded=False)), known, vehicle, fix, speed_sd_mps)
+        return cls(*begun, JUMPS - track.told)
+
+    def taken(self, track: Taken, vehicle: int, fix: Fix, motion: Motion) -> Elsewhere:
+        """Follow a fix that was shown to the track, too."""
+        taken = take(predict(self.belief, track.belief.time_s, motion), self.scatter, vehicle, fix)
+        ahead = self.ahead + taken.told - track.told
+        return Elsewhere(taken.belief, taken.scatter, ahead, self.count + 1, taken.believed)
+
+    @property
+    def won(self) -> bool:
+        """Whether it is likelier beyond doubt."""
+        return self.ahead > DECIDED and self.count >= AGREEING
+
+    @property
+    def lost(self) -> bool:
+        """Whether it is less likely beyond doubt, lies elsewhere itself, or has had its time."""
+        return self.ahead < -DECIDED or not self.follows or self.count >= TRIED
+
+    def fix(self, vehicle: int, like: Fix) -> Fix:
+        """Return what it says of a vehicle's place and velocity, as a fix."""
+        at = SIZE * vehicle
+        own = [at + i for i, name in enumerate(POSE[:7]) if name[-1] in "xyz" and name[-1] in like.states]
+        pose = self.belief.mean[at:]
+        return replace(
+            like,
+            states=tuple(POSE[i - at] for i in own),
+            position_m=pose[:3].copy(),
+            velocity_mps=pose[4:7].copy(),
+            covariance=self.belief.covariance[np.ix_(own, own)],
+        )
+
+
+def freely(scatter: Scatter, like: Fix) -> Fix:
+    """Return what the members of `Scatter` say of a vehicle's place and velocity, as a fix; its height is as told."""
+    assert like.position_m is not None
+    assert like.covariance is not None
+    (place_m, velocity_mps), level = scatter.mixed()
+    covariance = np.zeros((len(like.states) + 2,) * 2)
+    covariance[:4, :4] = level
+    if "z" in like.states:
+        covariance[4, 4] = scatter.scale**2 * like.covariance[2, 2]
+    return replace(
+        like,
+        states=("x", "y", "vx", "vy", "z")[: len(covariance)],
+        position_m=np.append(place_m, like.position_m[2]),
+        velocity_mps=np.append(velocity_mps, 0.0),
+        covariance=covariance,
+    )

@@ -1,0 +1,155 @@
+"""Vehicles that are followed by positions which others computed: what these gainsay, and what gainsays them.
+
+Beside the track run at most two others of a vehicle: one where positions put it that the track did not believe, until
+either is likelier by far, and of a site's only vehicle one that hears no sensor (`alone`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sonofix.geometry import SIZE, turning
+from sonofix.records import Event, Fix
+from sonofix.site import Site
+from sonofix.track import loose
+from sonofix.track.alone import Alone, Silence, unled
+from sonofix.track.belief import Belief, Motion, place, predict
+from sonofix.track.loose import Elsewhere, Taken
+from sonofix.track.rival import bare, follows
+from sonofix.track.scatter import Scatter, scatter
+
+
+class Positions:
+    """Follows all vehicles of a site by positions.
+
+    Attributes
+    ----------
+    judges : bool
+        Whether a track by positions alone tells whether the sensors of the only vehicle are right.
+    contested : bool (V,)
+        Vehicles that positions put elsewhere, with neither place decided for.
+    borne_out : bool (V,)
+        Vehicles whose sensors, and so the heading that they began with, positions have borne out.
+    """
+
+    def __init__(self, site: Site, sensed: bool) -> None:
+        count = len(site.vehicles)
+        self.judges = sensed and count == 1
+        self.contested = np.zeros(count, bool)
+        self.borne_out = np.zeros(count, bool)
+        self._ids = [vehicle.id for vehicle in site.vehicles]
+        self._speed_sd_mps = [v.max_speed_mps or loose.SPEED_SD_MPS for v in site.vehicles]
+        self._turns = bool(count and turning(site)[0])
+        self._scatter = [scatter()] * count
+        self._elsewhere: list[Elsewhere | None] = [None] * count
+        self._behind = np.zeros(count)
+        self._alone: tuple[Alone, Scatter] | None = None
+        self._silence = Silence()
+
+    def knowing(self, other: Positions) -> None:
+        """Begin with how positions erred by another's end."""
+        self._scatter = [replace(scatter(), heard=known.heard) for known in other._scatter]
+
+    def take(
+        self, belief: Belief, motion: Motion, fixes: Sequence[Fix], unproven: Sequence[bool]
+    ) -> tuple[Belief, np.ndarray, list[Event]]:
+        """Take in positions of one instant, to which a belief has been aged; return which entered (V,), and events.
+
+        ``unproven`` (V,): vehicles with a stated start that nothing has borne out yet.
+        """
+        events: list[Event] = []
+        entered = np.zeros(len(fixes), bool)
+        for who, found in enumerate(fixes):
+            if found.status != "ok":
+                continue
+            if not belief.placed[who]:
+                belief, self._scatter[who] = loose.put(belief, self._scatter[who], who, found, self._speed_sd_mps[who])
+                self._elsewhere[who], self.contested[who], entered[who] = None, False, True
+                self._alone = None
+                self._tell(events, belief, who, "start", "first position")
+                continue
+            known = self._scatter[who]
+            track = loose.take(belief, known, who, found)
+            belief, self._scatter[who] = track.belief, track.scatter
+            belief, entered[who] = self._contest(track, known, who, found, motion, events)
+            if not entered[who]:
+                text = f"a position {track.off_m:.2f} m, {track.off:.1f} deviations from the track: not believed"
+                events.append(Event(belief.time_s, self._ids[who], "excluded", text))
+            if self.judges:
+                belief = self._heed(belief, track, found, motion, bool(unproven[who]), events)
+        return belief, entered, events
+
+    def _contest(
+        self, track: Taken, known: Scatter, who: int, found: Fix, motion: Motion, events: list[Event]
+    ) -> tuple[Belief, bool]:
+        """Follow another place that positions tell, as long as either may be true; return whether this one entered."""
+        # by how much positions in a row that the track did not believe were likelier without it
+        self._behind[who] = 0.0 if track.believed else self._behind[who] + track.free - track.told
+        other = self._elsewhere[who]
+        if other is not None:
+            other = other.taken(track, who, found, motion)
+        if other is not None and other.won:
+            self._elsewhere[who], self.contested[who], self._alone = None, False, None
+            self._behind[who] = 0.0
+            self._scatter[who] = other.scatter
+            belief = place(track.belief, who, other.fix(who, found), np.zeros(2))
+            self._tell(events, belief, who, "reset", "positions disagreed with the track")
+            return belief, True
+        if self._behind[who] > loose.DECIDED:
+            self._elsewhere[who], self.contested[who], self._alone = None, False, None
+            self._behind[who] = 0.0
+            belief = place(track.belief, who, loose.freely(track.scatter, found), np.zeros(2))
+            self._tell(events, belief, who, "reset", f"positions err {track.scatter.scale:.1f} times as stated")
+            return belief, True
+        if (other is None or other.lost) and not track.believed:
+            other = Elsewhere.begun(track, known, who, found, self._speed_sd_mps[who])
+        elif other is not None and other.lost:
+            other = None
+        self._elsewhere[who], self.contested[who] = other, other is not None
+        return track.belief, track.believed
+
+    def _heed(
+        self, belief: Belief, track: Taken, found: Fix, motion: Motion, unproven: bool, events: list[Event]
+    ) -> Belief:
+        """Hear the only vehicle's own sensors only as long as positions are not far likelier without them."""
+        now_s = belief.time_s
+        if not belief.heeded:
+            if self._silence.over(now_s):
+                belief = replace(belief, heeded=True)
+                self._alone = unled(belief, self._turns), self._scatter[0]
+            return belief
+        if not loose.led(belief, 0):
+            self._alone = None
+            return belief
+        if self._alone is None:
+            begun = bare(replace(belief, heeded=False))
+            begun, known = loose.put(begun, self._scatter[0], 0, found, self._speed_sd_mps[0])
+            self._alone = Alone(begun), known
+            return belief
+        alone, known = self._alone
+        taken = loose.take(predict(alone.belief, now_s, motion), known, 0, found)
+        alone = alone.told(taken.belief, taken.told - track.told)
+        self._alone = alone, taken.scatter
+        if alone.lost:
+            self._alone = unled(belief, self._turns), self._scatter[0]
+            self.borne_out[0] = True
+        elif alone.won:
+            belief, self._scatter[0] = follows(belief, alone.belief), taken.scatter
+            self._elsewhere[0], self.contested[0] = None, False
+            if unproven and belief.inputs is not None and belief.inputs.wheel_slot[0] >= 0:
+                # wheels are right only as the heading is that they began with: it is found anew
+                belief = replace(belief, heeded=True)
+                self._alone = unled(belief, self._turns), taken.scatter
+                why = "positions gainsay how it was stated to start"
+            else:
+                why = f"positions gainsay its own sensors, unheard for {self._silence.begin(now_s):g} s"
+            self._tell(events, belief, 0, "reset", why)
+        return belief
+
+    def _tell(self, events: list[Event], belief: Belief, who: int, word: str, why: str) -> None:
+        """Tell where a vehicle was put."""
+        x, y, z = belief.mean[SIZE * who : SIZE * who + 3]
+        events.append(Event(belief.time_s, self._ids[who], word, f"{why}: placed at ({x:.3f}, {y:.3f}, {z:.3f}) m"))
