@@ -112,7 +112,7 @@ def smoothed(
             raise ValueError("a graph smooths between a recording's ends; leave out either the graph or the lag")
         yield from _lagging(recording, steps, rate_hz, lag_s, held)
         return
-    if graph and _by_positions(recording):
+    if graph and recording.by_positions:
         raise ValueError("a graph is made of ranges; positions.csv is smoothed without it (--smooth)")
     kept = list(steps)
     if not kept:
@@ -153,16 +153,10 @@ def _beginning(recording: Recording, time_s: float, held: Collection[str]) -> Fo
     return street.follower
 
 
-def _by_positions(recording: Recording) -> bool:
-    """Whether a recording holds nothing but positions to make a track of."""
-    ranged = recording.blocks is not None or recording.ranges is not None or "exchanges" in recording.tables
-    return not ranged and "positions" in recording.tables
-
-
 def _site_of(recording: Recording) -> Site:
     """Return a recording's site; where positions are of vehicles' origins, nothing rides on these."""
     site = recording.site
-    if not _by_positions(recording):
+    if not recording.by_positions:
         return site
     fixed = tuple(beacon for beacon in site.beacons if beacon.vehicle is None)
     return site.model_copy(update={"beacons": fixed, "microphones": ()})

@@ -105,7 +105,7 @@ class Recording:
         When each sync command arrived; None: epochs start at sample 0 and every period.
     ranges : RangeRows or None
     tables : mapping from file stem ("odometry", "steps", "compass", "imu", "temperature", "start", "bearings",
-        "exchanges") to Table
+        "exchanges", "positions") to Table
     references : mapping from beacon id to ReferenceBurst
         Recorded bursts that the site's codes name.
     """
@@ -118,6 +118,12 @@ class Recording:
     ranges: RangeRows | None = None
     tables: Mapping[str, Table] = field(default_factory=dict)
     references: Mapping[str, ReferenceBurst] = field(default_factory=dict)
+
+    @property
+    def by_positions(self) -> bool:
+        """Whether it holds nothing but positions that others computed to make a track of."""
+        ranged = self.blocks is not None or self.ranges is not None or "exchanges" in self.tables
+        return not ranged and "positions" in self.tables
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,13 @@ def oddities(
 ) -> list[str]:
     """Return what is odd about a recording, in plain sentences; `figures` of its samples, None without samples."""
     site = recording.site
-    sentences = [*_places(site), *_schedule(site, references), *_air(site), *_chips(site)]
+    sentences = [
+        *_places(site),
+        *([] if recording.by_positions else _reach(site)),
+        *_schedule(site, references),
+        *_air(site),
+        *_chips(site),
+    ]
     if figures is not None:
         sentences += [*_samples(recording, figures), *_sync(recording, figures)]
     sentences += [*_sensors(recording, figures), *unused(recording)]
@@ -36,13 +42,10 @@ def oddities(
 
 def unused(recording: Recording) -> Iterator[str]:
     """Tell positions that are not used, since what is there beside them says more."""
-    if "positions" not in recording.tables:
+    if "positions" not in recording.tables or recording.by_positions:
         return
-    heard = "the capture" if recording.blocks is not None else "ranges.csv"
-    if recording.blocks is None and recording.ranges is None:
-        if "exchanges" not in recording.tables:
-            return
-        heard = "exchanges.csv"
+    heard = "exchanges.csv" if recording.ranges is None else "ranges.csv"
+    heard = heard if recording.blocks is None else "the capture"
     yield (
         f"positions.csv is not used: the track is made of {heard}, whose ranges say more than positions made of "
         "ranges; to follow the positions instead, put them into a folder of their own, with site.toml and the tables "
@@ -82,6 +85,10 @@ def _places(site: Site) -> Iterator[str]:
     guesses = [beacon.id for beacon in site.beacons if beacon.position_sd_m > 0]
     if guesses:
         yield f"the places of {', '.join(guesses)} are guesses (position_sd_m > 0)"
+
+
+def _reach(site: Site) -> Iterator[str]:
+    """Vehicles of which ranges would tell nothing, or not all."""
     for vehicle in site.vehicles:
         if not any(node.vehicle == vehicle.id for node in (*site.beacons, *site.microphones)):
             yield f"vehicle {vehicle.id} carries neither beacon nor microphone, so no sound tells of it"
@@ -208,8 +215,10 @@ def _sensors(recording: Recording, figures: CaptureFigures | None) -> Iterator[s
         first_s, last_s = 0.0, figures.sample_count / recording.rate_hz
     elif recording.ranges is not None:
         first_s, last_s = float(recording.ranges.time_s.min()), float(recording.ranges.time_s.max())
-    elif "positions" in recording.tables and "exchanges" not in recording.tables:
+    elif recording.by_positions:
         told_s = recording.tables["positions"].columns["time_s"]
+        if not len(told_s):
+            return
         first_s, last_s = float(told_s.min()), float(told_s.max())
     else:
         return

@@ -227,7 +227,8 @@ class Follower:
         self._undecided = self._given & self._positions.contested
         self._stated &= ~self._positions.borne_out
         self._prove_start(fixes, events)
-        self.belief = set_out(self._course.head(self.belief))
+        if self.belief.heeded:
+            self.belief = set_out(self._course.head(self.belief))
         events += self._rest.take(self.belief)
         shown = np.flatnonzero(self.belief.placed & ~self._undecided).tolist()
         return tuple(estimate(self.belief, self.site, who, "fused" if entered[who] else "predicted") for who in shown)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sonofix.geometry import POSE, SIZE
+from sonofix.geometry import POSE, SIZE, YAW
 from sonofix.records import Fix
 from sonofix.track.belief import Belief, Motion, place, predict
 from sonofix.track.kernel import joseph
@@ -103,9 +103,10 @@ def led(belief: Belief, vehicle: int) -> bool:
     inputs = belief.inputs
     if inputs is None or not belief.heeded:
         return False
-    wheel, step = int(inputs.wheel_slot[vehicle]), int(inputs.step_slot[vehicle])
-    # an arc needs the heading that its anchor had
-    return (wheel >= 0 and bool(belief.free[wheel + 2])) or (step >= 0 and bool(belief.free[step]))
+    # wheels lead along a heading
+    headed = inputs.wheel_slot[vehicle] >= 0 and bool(belief.free[SIZE * vehicle + YAW])
+    step = int(inputs.step_slot[vehicle])
+    return bool(headed or (step >= 0 and belief.free[step]))
 
 
 def put(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix, speed_sd_mps: float) -> tuple[Belief, Scatter]:

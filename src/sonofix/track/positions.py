@@ -17,6 +17,7 @@ from sonofix.site import Site
 from sonofix.track import loose
 from sonofix.track.alone import Alone, Silence, unled
 from sonofix.track.belief import Belief, Motion, place, predict
+from sonofix.track.gaps import Gaps
 from sonofix.track.loose import Elsewhere, Taken
 from sonofix.track.rival import bare, follows
 from sonofix.track.scatter import Scatter, scatter
@@ -48,6 +49,7 @@ class Positions:
         self._behind = np.zeros(count)
         self._alone: tuple[Alone, Scatter] | None = None
         self._silence = Silence()
+        self._gaps = Gaps(self._ids)
 
     def knowing(self, other: Positions) -> None:
         """Begin with how positions erred by another's end."""
@@ -60,7 +62,7 @@ class Positions:
 
         ``unproven`` (V,): vehicles with a stated start that nothing has borne out yet.
         """
-        events: list[Event] = []
+        events = self._gaps.take(belief.time_s, fixes)
         entered = np.zeros(len(fixes), bool)
         for who, found in enumerate(fixes):
             if found.status != "ok":
