@@ -162,6 +162,14 @@ def test_a_mistake_is_told_where_it_is(path, value, where, says):
     assert says in found[0][1]
 
 
+def test_only_vehicles_that_nothing_hears_need_no_beacon():
+    assert Site.model_validate({"name": "yard", "vehicle": [{"id": "agv"}]}).beacons == ()
+    for rest in ({}, {"vehicle": [{"id": "agv"}], "microphone": [{"id": "M1", "position_m": [0, 0, 0]}]}):
+        assert (("beacon",), "nothing sends; add at least one [[beacon]]") in [
+            (where, says.removeprefix("Value error, ")) for where, says in mistakes({"name": "yard"} | rest)
+        ]
+
+
 def test_all_mistakes_are_told_at_once():
     """Field errors must not hide broken rules of the same table, nor of the site."""
     raw = copy.deepcopy(RAW)

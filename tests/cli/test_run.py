@@ -85,6 +85,34 @@ def test_ranges_in_everything_out(tmp_path):
     assert f"Written to {out}" in told.stdout
 
 
+def test_positions_beside_ranges_are_not_used_and_told(tmp_path):
+    folder = ranged(tmp_path / "rec", 3)
+    (folder / "positions.csv").write_text("time_s,x_m,y_m\n0.0,90.0,90.0\n1.0,90.0,90.0\n")
+    ran = runner.invoke(app, ["run", str(folder), "--no-plot"])
+    assert "Note: positions.csv is not used: the track is made of ranges.csv" in ran.stdout.replace("\n", " ")
+    assert all(float(row["x_m"]) < 10 for row in rows_of(folder / "out" / "track.csv"))
+    checked = runner.invoke(app, ["check", str(folder)]).stdout
+    assert "positions.csv is not used: the track is made of ranges.csv" in checked
+    (folder / "ranges.csv").unlink()
+    ran = runner.invoke(app, ["run", str(folder), "--no-plot"])
+    assert "positions.csv" not in ran.stdout
+    assert all(float(row["x_m"]) == 90 for row in rows_of(folder / "out" / "track.csv"))
+
+
+def test_a_site_of_vehicles_alone_has_positions(tmp_path):
+    (tmp_path / "site.toml").write_text('format = 1\n[site]\nname = "yard"\n[[vehicle]]\nid = "agv"\nz_m = 0.0\n')
+    (tmp_path / "positions.csv").write_text("time_s,x_m,y_m\n0.0,1.0,2.0\n1.0,1.1,2.0\n")
+    checked = runner.invoke(app, ["check", str(tmp_path)])
+    assert checked.exit_code == 0
+    assert "Odd: 1\n  - there is no truth.csv" in checked.stdout
+    assert runner.invoke(app, ["run", str(tmp_path)]).exit_code == 0
+    assert len(rows_of(tmp_path / "out" / "track.csv")) == 2
+    (tmp_path / "positions.csv").unlink()
+    told = runner.invoke(app, ["run", str(tmp_path)])
+    assert told.exit_code == 2
+    assert "nothing to compute positions from" in told.stderr
+
+
 def test_an_open_height_asks_for_the_level(tmp_path):
     site = hall()
     site["vehicle"] = [{"id": "agv"}]
