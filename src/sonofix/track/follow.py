@@ -217,7 +217,7 @@ class Follower:
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
         events += self._rest.take(self.belief)
-        self._prove_start(fixes, events)
+        self._prove_start(fixes, events, self._judges_sensors)
         return self._estimates(links, used), used, tuple(events)
 
     def _stand(self, fixes: tuple[Fix, ...], events: list[Event]) -> tuple[Estimate, ...]:
@@ -225,8 +225,8 @@ class Follower:
         self.belief, entered, told = self._positions.take(self.belief, self.motion, fixes, self._stated.tolist())
         events += told
         self._undecided = self._given & self._positions.contested
+        self._prove_start(fixes, events, self._positions.judges)
         self._stated &= ~self._positions.borne_out
-        self._prove_start(fixes, events)
         if self.belief.heeded:
             self.belief = set_out(self._course.head(self.belief))
         events += self._rest.take(self.belief)
@@ -275,8 +275,8 @@ class Follower:
         contests = self._given & np.array([vehicle.id in fixed for vehicle in self.site.vehicles], bool)
         return (contests & self._corrected) | self._undecided
 
-    def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event]) -> None:
-        """Note whose stated start ranges gainsay before they have borne it out."""
+    def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event], judged: bool) -> None:
+        """Note whose stated start is gainsaid before it is borne out; ``judged``: so are a vehicle's own sensors."""
         fixed = {found.vehicle for found in fixes if found.status == "ok"}
         for who in np.flatnonzero(self._stated).tolist():
             name = self.site.vehicles[who].id
@@ -285,7 +285,6 @@ class Follower:
                 self.refuted[who], self._stated[who], self._given[who] = True, False, False
             elif name in fixed and not self._undecided[who]:
                 # a heading is borne out by sensors that it makes right (`_heed`)
-                judged = self._judges_sensors or (self._positions.judges and not self._positions.borne_out[who])
                 self._given[who], self._stated[who] = False, judged
 
     def _doubt_wheels(
