@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, turning
 from sonofix.records import Event, Fix
@@ -57,7 +58,7 @@ class Positions:
 
     def take(
         self, belief: Belief, motion: Motion, fixes: Sequence[Fix], unproven: Sequence[bool]
-    ) -> tuple[Belief, np.ndarray, list[Event]]:
+    ) -> tuple[Belief, NDArray[np.bool_], list[Event]]:
         """Take in positions of one instant, to which a belief has been aged; return which entered (V,), and events.
 
         ``unproven`` (V,): vehicles with a stated start that nothing has borne out yet.
