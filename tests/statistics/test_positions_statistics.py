@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from sonofix.flow import run
-from sonofix.records import Floats, Recording, Table
+from sonofix.records import Floats, Innovation, Recording, Table
 from sonofix.site import Site
 from sonofix.track.belief import Motion
 from sonofix.track.scatter import REMEMBERED, SCALES
@@ -30,7 +30,9 @@ def drive(rng: np.random.Generator) -> Floats:
 
 @pytest.mark.parametrize(("stated_m", "sd_m"), [(None, 0.1), (None, 0.3), (None, 1.0), (0.1, 1.0), (1.0, 1.0)])
 def test_nees_lies_in_its_band(stated_m: float | None, sd_m: float, rng: np.random.Generator) -> None:
-    squared, worse = [], []
+    squared: list[float] = []
+    worse: list[float] = []
+    innovations: list[Innovation] = []
     time_s = PERIOD_S * np.arange(COUNT)
     for _ in range(RUNS):
         places = drive(rng)
@@ -39,7 +41,10 @@ def test_nees_lies_in_its_band(stated_m: float | None, sd_m: float, rng: np.rand
         errors = []
         for sd in (stated_m, sd_m):
             stated = columns if sd is None else columns | {"sd_m": np.full(COUNT, sd)}
-            found = [e for s in run(Recording(site=SITE, tables={"positions": Table(stated)})) for e in s.estimates]
+            steps = list(run(Recording(site=SITE, tables={"positions": Table(stated)})))
+            found = [e for s in steps for e in s.estimates]
+            if sd is stated_m:
+                innovations += [one for s in steps[20:] for one in s.innovations]
             miss = np.array([e.position_m[:2] for e in found]) - places
             errors.append(np.mean(np.sum(miss[20:] ** 2, axis=1)))
             if sd is stated_m:
@@ -55,3 +60,8 @@ def test_nees_lies_in_its_band(stated_m: float | None, sd_m: float, rng: np.rand
     slack = 1.0 + 2.0 / np.sqrt(REMEMBERED) + 2.0 * np.log(SCALES[1])
     assert low / slack < sum(squared) / freedom < high * slack
     assert np.sqrt(np.mean(worse)) < 1.15
+    # innovations of a right filter are white: each corrects by two coordinates
+    assert all(one.rows == 2 for one in innovations)
+    nis, freedom = sum(one.nis for one in innovations), 2 * len(innovations)
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], freedom) / freedom
+    assert low / slack < nis / freedom < high * slack

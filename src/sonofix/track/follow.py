@@ -224,6 +224,7 @@ class Follower:
         """Take in positions that others computed; return estimates."""
         self.belief, entered, told = self._positions.take(self.belief, self.motion, fixes, self._stated.tolist())
         events += told
+        self.innovation = self._positions.innovation
         self._undecided = self._given & self._positions.contested
         self._prove_start(fixes, events, self._positions.judges)
         self._stated &= ~self._positions.borne_out

@@ -52,6 +52,8 @@ class Taken:
     free: float
     off: float
     off_m: float
+    rows: int
+    """Coordinates that it told."""
 
     @property
     def believed(self) -> bool:
@@ -89,7 +91,7 @@ def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
         gain = np.linalg.solve(spread + noise, crossed).T
         covariance = joseph(belief.covariance, gain, derivative, noise)
         belief = replace(belief, mean=belief.mean + gain @ miss, covariance=covariance)
-    return Taken(belief, scatter, told, free, off, off_m)
+    return Taken(belief, scatter, told, free, off, off_m, len(axes))
 
 
 def _level_m2(fix: Fix) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.geometry import SIZE, turning
-from sonofix.records import Event, Fix
+from sonofix.records import Event, Fix, Innovation
 from sonofix.site import Site
 from sonofix.track import loose
 from sonofix.track.alone import Alone, Silence, unled
@@ -35,6 +35,8 @@ class Positions:
         Vehicles that positions put elsewhere, with neither place decided for.
     borne_out : bool (V,)
         Vehicles whose sensors, and so the heading that they began with, positions have borne out.
+    innovation : Innovation or None
+        Of the latest positions that entered together.
     """
 
     def __init__(self, site: Site, sensed: bool) -> None:
@@ -51,6 +53,7 @@ class Positions:
         self._alone: tuple[Alone, Scatter] | None = None
         self._silence = Silence()
         self._gaps = Gaps(self._ids)
+        self.innovation: Innovation | None = None
 
     def knowing(self, other: Positions) -> None:
         """Begin with how positions erred by another's end."""
@@ -65,6 +68,7 @@ class Positions:
         """
         events = self._gaps.take(belief.time_s, fixes)
         entered = np.zeros(len(fixes), bool)
+        rows, nis = 0, 0.0
         for who, found in enumerate(fixes):
             if found.status != "ok":
                 continue
@@ -77,12 +81,15 @@ class Positions:
             known = self._scatter[who]
             track = loose.take(belief, known, who, found)
             belief, self._scatter[who] = track.belief, track.scatter
+            if track.believed:
+                rows, nis = rows + track.rows, nis + track.off**2
             belief, entered[who] = self._contest(track, known, who, found, motion, events)
             if not entered[who]:
                 text = f"a position {track.off_m:.2f} m, {track.off:.1f} deviations from the track: not believed"
                 events.append(Event(belief.time_s, self._ids[who], "excluded", text))
             if self.judges:
                 belief = self._heed(belief, track, found, motion, bool(unproven[who]), events)
+        self.innovation = Innovation(belief.time_s, rows, nis) if rows else None
         return belief, entered, events
 
     def _contest(
