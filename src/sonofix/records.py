@@ -961,13 +961,13 @@ class Curve:
     """A line or a cloud of points in a study's panel; NaN in ``y`` breaks it.
 
     ``kind`` says what it shows: "truth", "raw" (single measurements), "alone" (what one sensor does without help),
-    "result" (what an estimator makes of all) or "bound" (a claim, a limit).
+    "result" (what an estimator makes of all), "bound" (a claim, a limit) or "points" (cases apart, not joined).
     """
 
     name: str
     x: Floats
     y: Floats
-    kind: Literal["truth", "raw", "alone", "result", "bound"]
+    kind: Literal["truth", "raw", "alone", "result", "bound", "points"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -1014,11 +1014,23 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Listing:
+    """A table of a study, of one run: ``name`` is its file's, ``columns`` carry units, a row a step."""
+
+    name: str
+    title: str
+    note: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str | int | float, ...], ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """What a study shows: ``panels`` row by row, so many ``columns``, and the figures found."""
+    """What a study shows: ``panels`` row by row, so many ``columns``, the figures found, and tables."""
 
     title: str
     note: str
     columns: int
     panels: tuple[Panel, ...]
     findings: tuple[Finding, ...]
+    listings: tuple[Listing, ...] = ()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sonofix.records import Floats
-from sonofix.team.leapfrog import Formation, begin, foreseen, leapt, opened, ranged
+from sonofix.team.leapfrog import Formation, begin, leapt, opened, ranged
 
 ROBOTS = ("K", "R2", "R1")
 PAIRS = (("K", "R2"), ("K", "R1"), ("R2", "R1"))
@@ -100,16 +100,6 @@ def test_a_robot_that_nobody_ranges_leaves_the_start_open() -> None:
     place = np.vstack([START_M, [9.0, 9.0]])
     pairs, heard = PAIRS * 2, np.tile(distances(START_M), 2)
     assert begin(four, place, pairs, heard, 1e-6 * np.eye(6), 0.0).status == "flat"
-
-
-def test_foreseen_is_what_a_leap_leaves() -> None:
-    formation, true = begun(scale_sd=5e-4), START_M.copy()
-    true[0] = [11.0, 7.0]
-    odometry = 0.4**2 * np.eye(2)
-    leap = leapt(formation, "K", true[0], odometry, PAIRS, distances(true), NOISE)
-    thought = foreseen(formation, "K", true[0], odometry, PAIRS, NOISE)
-    np.testing.assert_allclose(thought.covariance, leap.formation.covariance, rtol=1e-6, atol=1e-15)
-    np.testing.assert_allclose(thought.place_m, leap.formation.place_m, atol=1e-9)
 
 
 def test_dead_reckoning_opens_one_robot_alone() -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import combinations, pairwise
+from itertools import combinations
 
 import numpy as np
 import pytest
 
+from sonofix.records import Floats
 from sonofix.studies import robots_strip as study
+from sonofix.team.ahead import Course, Ranging
 from sonofix.team.leapfrog import Formation, begin
-from sonofix.team.planner import Course, Ranging, ahead, hindmost, landing, plan
+from sonofix.team.planner import Plan, plan
 
 RANGING = Ranging(0.0015, 10.0, 1.32, 18.0)
 COURSE = Course(np.array([2.0, 1.0]), 0.5, 60.0)
@@ -18,81 +20,70 @@ CHOICE = {"steps_m": (7.5, 15.0, 22.5), "widths_m": (7.5, 12.5)}
 
 def formation(scale_sd: float = 0.0, course: Course = COURSE) -> Formation:
     robots = ("K", "R2", "R1")
-    place = np.array([course.place(i * 10 / 3, (-5.0, 5.0, -5.0)[i]) for i in range(3)])
+    place = course.place(np.array([[i * 10 / 3, (-5.0, 5.0, -5.0)[i]] for i in range(3)]))
+    return begun(robots, place, scale_sd)
+
+
+def begun(robots: tuple[str, ...], place: Floats, scale_sd: float = 0.0) -> Formation:
     pairs = list(combinations(robots, 2))
     distance = np.array([np.hypot(*(place[robots.index(b)] - place[robots.index(a)])) for a, b in pairs])
     return begin(robots, place, pairs, distance, RANGING.covariance_m2(distance), scale_sd).formation
 
 
-def test_ranges_grow_worse_with_the_sound_that_is_lost() -> None:
-    """Deviation goes with one over the amplitude: twice as far is 6 dB and 13.2 dB less."""
-    variance = np.diag(RANGING.covariance_m2(np.array([10.0, 20.0])))
-    np.testing.assert_allclose(np.sqrt(variance), [0.0015, 0.0015 * 2 * 10 ** (13.2 / 20)])
-
-
-def test_places_are_told_along_the_course_and_to_its_left() -> None:
-    place = COURSE.place(7.0, -2.0)
-    np.testing.assert_allclose(COURSE.along_and_across(place[None]), [[7.0, -2.0]], atol=1e-12)
-    left = COURSE.place(0.0, 1.0) - COURSE.start_m
-    np.testing.assert_allclose(left, [-np.sin(0.5), np.cos(0.5)])
-
-
-def test_the_hindmost_goes_past_the_foremost_to_the_other_side() -> None:
-    team = formation()
-    assert hindmost(team, COURSE) == "K"
-    to = COURSE.along_and_across(landing(team, "K", COURSE, 12.0, 8.0)[None])[0]
-    np.testing.assert_allclose(to, [20 / 3 + 4.0, 4.0])
-    short = Course(COURSE.start_m, COURSE.heading_rad, 8.0)
-    assert short.along_and_across(landing(team, "K", short, 12.0, 8.0)[None])[0, 0] == pytest.approx(8.0)
-
-
 def test_looser_wishes_need_fewer_leaps() -> None:
     team = formation(3e-4)
-    plans = [plan(team, COURSE, RANGING, wanted, **CHOICE) for wanted in (0.2, 0.03, 0.025)]
+    plans = [plan(team, COURSE, RANGING, wanted, **CHOICE) for wanted in (0.2, 0.03, 0.026)]
     assert [p.status for p in plans] == ["ok"] * 3
     assert plans[0].leaps < plans[1].leaps <= plans[2].leaps
-    for p, wanted in zip(plans, (0.2, 0.03, 0.025), strict=True):
+    for p, wanted in zip(plans, (0.2, 0.03, 0.026), strict=True):
         assert p.end_sd_m <= wanted
-        assert p.robot == "K"
+
+
+def test_a_wish_out_of_reach_is_answered_by_the_best_there_is() -> None:
+    team = formation(3e-4)
     best = plan(team, COURSE, RANGING, 0.001, **CHOICE)
     assert best.status == "beyond"
-    assert best.end_sd_m <= plans[-1].end_sd_m
     # the speed of sound alone costs 3e-4 of the way
     assert best.end_sd_m > 3e-4 * 50.0
+    assert f"best one with {best.end_sd_m:.3g} m" in best.remedy
+    # that much is reached when it is asked for, and not a tenth less
+    assert plan(team, COURSE, RANGING, 1.001 * best.end_sd_m, **CHOICE).status == "ok"
+    assert plan(team, COURSE, RANGING, 0.9 * best.end_sd_m, **CHOICE).status == "beyond"
 
 
-def test_a_plan_is_what_leaps_tried_ahead_give() -> None:
-    team = formation()
-    found = plan(team, COURSE, RANGING, 0.05, **CHOICE)
-    tried = ahead(team, COURSE, RANGING, 0.05, found.step_m, found.width_m, found.robot)
-    assert tried is not None
-    leaps, known = tried
-    assert len(leaps) == found.leaps
-    np.testing.assert_array_equal(leaps[0][1], found.place_m)
-    assert known[-1].sd_m(leaps[-1][0]) == found.end_sd_m
-    # roles rotate, and each leap leaves two standing
-    assert {robot for robot, _ in leaps} == {"K", "R2", "R1"}
-    assert all(a[0] != b[0] for a, b in pairwise(leaps))
+def test_the_foremost_never_goes_and_the_one_that_goes_passes_it() -> None:
+    """Whatever is wanted: else a robot might be ranged anew for ever, each time a little better."""
+    for wanted in (0.2, 0.02, 0.001):
+        for turned in range(3):
+            place = COURSE.place(np.array([[0.0, -5.0], [3.0, 5.0], [6.0, -5.0]])[[turned, turned - 1, turned - 2]])
+            found = plan(begun(("A", "B", "C"), place), COURSE, RANGING, wanted, **CHOICE)
+            along = COURSE.along_and_across(place)[:, 0]
+            assert found.robot != ("A", "B", "C")[int(np.argmax(along))]
+            assert COURSE.along_and_across(found.place_m)[0] > along.max() + 2.0
 
 
-def test_what_was_foreseen_is_found() -> None:
-    """The root mean square of 2 n normal errors scatters by at most 1 / √(2 n) where one direction holds them all."""
-    n = 80
-    case = study.Case("as planned", 0.0, None, 15.0, 12.5)
+@pytest.mark.parametrize("wanted", [0.06, 0.03])
+def test_plans_asked_anew_after_each_leap_reach_what_is_wanted(wanted: float) -> None:
+    """What is stated of the end hardly scatters; what is found does, by 1 / √(2 n) where one direction holds it all."""
+    n = 12
     runs = []
     for k in range(n):
         rng = np.random.default_rng([3, k])
-        runs.append(study.drive(case, study.stated(RANGING, rng), rng))
-    start = study.START_M
-    pairs = list(combinations(study.ROBOTS, 2))
-    distance = np.array([np.hypot(*(start[study.ROBOTS.index(b)] - start[study.ROBOTS.index(a)])) for a, b in pairs])
-    team = begin(study.ROBOTS, start, pairs, distance, RANGING.covariance_m2(distance), 0.0).formation
-    tried = ahead(team, study.COURSE, RANGING, study.WAY_SD, 15.0, 12.5)
-    assert tried is not None
-    foreseen = tried[1][-1].sd_m(tried[0][-1][0])
+        ears = study.stated(RANGING, rng)
+
+        def ask(now: Formation, wanted: float = wanted) -> Plan:
+            return plan(now, study.COURSE, RANGING, wanted, study.WAY_SD)
+
+        runs.append(study.drive(study.Case("planned", 0.0), ears, rng, ask))
+    stated = np.sqrt([np.trace(run.covariance_m2[-1]) for run in runs])
+    # the last leap may land beside what was foreseen of it, which a twentieth covers
+    assert stated.max() < 1.05 * wanted
+    assert 0.75 * wanted < np.sqrt(np.mean(stated**2)) <= wanted
     found = np.sqrt(np.mean([run.miss_m[-1] @ run.miss_m[-1] for run in runs]))
-    # robots land where wheels take them, not where they should: a tenth more or less
-    assert abs(found / foreseen - 1.0) < 0.1 + 4 / np.sqrt(2 * n)
+    assert found < wanted * (1 + 4 / np.sqrt(2 * n))
+    assert all(len(run.plans) == len(run.robots) and run.plans[-1].leaps == 1 for run in runs)
+    # all were told to stay within reach of each other, whatever odometry does
+    assert max(run.farthest_m.max() for run in runs) <= RANGING.reach_m
 
 
 def test_what_cannot_be_is_told() -> None:
@@ -100,7 +91,8 @@ def test_what_cannot_be_is_told() -> None:
     found = plan(formation(), COURSE, near, 0.1, **CHOICE)
     assert (found.status, found.robot) == ("unreachable", "")
     assert "beyond 5 m of each other" in found.remedy
-    with pytest.raises(ValueError, match="above 0"):
-        plan(formation(), COURSE, RANGING, 0.0)
+    for wrong in (0.0, np.nan):
+        with pytest.raises(ValueError, match="above 0"):
+            plan(formation(), COURSE, RANGING, wrong)
     with pytest.raises(ValueError, match="at the end"):
         plan(formation(), Course(COURSE.start_m, COURSE.heading_rad, 3.0), RANGING, 0.1)

@@ -23,9 +23,15 @@ def study(
     waveforms: Annotated[
         int, typer.Option(help="Runs from waveforms through the receiver, some ten seconds each; 0: none.", min=0)
     ] = 1,
+    wanted_m: Annotated[
+        float | None,
+        typer.Option(
+            help="Of leapfrog: end error in m after 100 m (1 σ) that the planner is asked for.", show_default="0.06"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 0,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for study.png, curves.csv and findings.json.")
+        Path | None, typer.Option("-o", "--out", help="Folder for study.png, curves.csv, findings.json.")
     ] = None,
     plot: Annotated[bool, typer.Option(help="Draw study.png.")] = True,
 ) -> None:
@@ -44,13 +50,15 @@ def study(
     sonofix study pedestrian --runs 1000 --waveforms 0
 
     sonofix study robots --part collision -o collision
+
+    sonofix study robots --part leapfrog --wanted-m 0.04 -o leapfrog
     """
     from sonofix.files.writing import results_folder
     from sonofix.studies import PARTS, begin
 
     if part is None and name in PARTS:
         part = PARTS[name][0]
-    work = begin(name, runs, seed, waveforms, part)
+    work = begin(name, runs, seed, waveforms, part, wanted_m)
     if out is not None:
         results_folder(out)
     stopped = not _finished(work)
@@ -88,6 +96,15 @@ def _tell(sheet: Sheet) -> None:
         for finding in sheet.findings
     }
     print_table(sheet.title, ("found", "runs", "expected"), rows)
+    for listing in sheet.listings:
+        lines = {cell_text(first): tuple(map(cell_text, cells)) for first, *cells in listing.rows}
+        print_table(listing.title, listing.columns[1:], lines)
+        speaker().print(listing.note)
+
+
+def cell_text(cell: str | float) -> str:
+    """Write a cell of a listing: four decimals where it is no whole number."""
+    return f"{cell:.4f}" if isinstance(cell, float) else str(cell)
 
 
 def found_text(finding: Finding) -> str:
@@ -126,6 +143,12 @@ def _write(out: Path, name: str, part: str | None, seed: int, sheet: Sheet) -> N
             for x, y in zip(curve.x.tolist(), curve.y.tolist(), strict=True):
                 rows.writerow((title, curve.name, *("" if v != v else f"{v:.9g}" for v in (x, y))))
     write_text(out / "curves.csv", text.getvalue())
+    for listing in sheet.listings:
+        text = io.StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(listing.columns)
+        rows.writerows([f"{cell:.9g}" if isinstance(cell, float) else cell for cell in row] for row in listing.rows)
+        write_text(out / f"{listing.name}.csv", text.getvalue())
     findings = [asdict(finding) for finding in sheet.findings]
     content = {"study": name} | ({"part": part} if part else {}) | {"seed": seed, "findings": findings}
     write_text(out / "findings.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")

@@ -18,6 +18,14 @@ _LINES = {
     "alone": {"color": style.MUTED, "linewidth": 1.3, "zorder": 2},
     "result": {"color": style.USED, "linewidth": 2.0, "zorder": 5},
     "bound": {"color": style.GOOD, "linewidth": 1.1, "linestyle": (0, (2, 2)), "zorder": 1},
+    "points": {
+        "color": style.CATEGORIES[1],
+        "linestyle": "none",
+        "marker": "o",
+        "markersize": 6,
+        "zorder": 6,
+        "clip_on": False,
+    },
 }
 _LEFT, _RIGHT, _TOP = 0.05, 1.0, 0.845
 _LINE = 0.0205
@@ -50,7 +58,7 @@ def draw_study(sheet: Sheet, found: Sequence[tuple[str, str, str]] = ()) -> Figu
         for k, panel in enumerate(sheet.panels):
             row, column = divmod(k, sheet.columns)
             box = (_LEFT + column * wide, _TOP - (row + 1) * high + 0.06, wide - 0.05, high - 0.085)
-            _panel(figure.add_axes(box), panel)
+            _panel(figure.add_axes(box), panel, 3 if sheet.columns > 2 else 6)
         for k, (case, quantity, figure_text) in enumerate(found):
             column, line = divmod(k, max(lines, 1))
             y = floor - 0.045 - _LINE * line
@@ -62,7 +70,8 @@ def draw_study(sheet: Sheet, found: Sequence[tuple[str, str, str]] = ()) -> Figu
     return figure
 
 
-def _panel(axes: Axes, panel: Panel) -> None:
+def _panel(axes: Axes, panel: Panel, most: int) -> None:
+    """Draw a panel; a legend above its curves has so many names a line at most."""
     style.dress(axes, panel.title, panel.note)
     for first, last in panel.blind:
         axes.axvspan(first, last, color=style.EDGE, alpha=0.35, linewidth=0, zorder=0)
@@ -81,5 +90,5 @@ def _panel(axes: Axes, panel: Panel) -> None:
         # limits count as proposals, which the aspect may widen
         axes.set_autoscale_on(True)
         axes.set_aspect("equal", adjustable="datalim")
-    columns = len(panel.curves) if panel.logarithmic else 1
+    columns = min(len(panel.curves), most) if panel.logarithmic else 1
     axes.legend(loc="upper left" if panel.logarithmic else "best", fontsize=8.5, ncols=columns, handlelength=1.8)

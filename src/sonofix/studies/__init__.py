@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
+from math import inf
 
 from sonofix.studies.work import Work
 
@@ -18,7 +19,13 @@ PARTS = {"robots": ("detection", "collision", "leapfrog")}
 """Studies of several parts, of which one is done at a time."""
 
 
-def begin(name: str, runs: int, seed: int, waveforms: int, part: str | None = None) -> Work:
+PLANNED = ("robots", "leapfrog")
+"""The study and part that has a planner."""
+
+
+def begin(
+    name: str, runs: int, seed: int, waveforms: int, part: str | None = None, wanted_m: float | None = None
+) -> Work:
     """Set a study up; nothing is computed yet.
 
     Parameters
@@ -33,6 +40,8 @@ def begin(name: str, runs: int, seed: int, waveforms: int, part: str | None = No
         Runs from waveforms through the receiver, 0 or more.
     part : str or None
         Of a study that has `PARTS`.
+    wanted_m : float or None
+        End error that the planner of `PLANNED` is asked for.
 
     Raises
     ------
@@ -48,5 +57,11 @@ def begin(name: str, runs: int, seed: int, waveforms: int, part: str | None = No
     if part not in (parts or (None,)):
         told = f"choose of {', '.join(parts)}" if parts else "it is of one piece: leave the part out"
         raise ValueError(f"study {name}, part {part}: there is none of that name; {told}")
+    if wanted_m is not None and (name, part) != PLANNED:
+        raise ValueError(f"wanted_m {wanted_m:g}: only study {PLANNED[0]}, part {PLANNED[1]} plans for an end error")
+    if wanted_m is not None and not 0 < wanted_m < inf:
+        raise ValueError(f"wanted_m {wanted_m:g}: the end error wanted must be above 0 m, and finite")
     study: Callable[..., Work] = import_module(f"sonofix.studies.{name.replace('-', '_')}").study
-    return study(runs, seed, waveforms, part) if parts else study(runs, seed, waveforms)
+    if not parts:
+        return study(runs, seed, waveforms)
+    return study(runs, seed, waveforms, part, wanted_m)

@@ -8,6 +8,8 @@ from sonofix.studies.robots_leapfrog import Leapfrog
 from sonofix.studies.work import Work
 
 
-def study(runs: int, seed: int, waveforms: int, part: str) -> Work:
-    """Set one part up, "detection", "collision" or "leapfrog"."""
-    return {"detection": Detection, "collision": Collision, "leapfrog": Leapfrog}[part](runs, seed, waveforms)
+def study(runs: int, seed: int, waveforms: int, part: str, wanted_m: float | None = None) -> Work:
+    """Set one part up, "detection", "collision" or "leapfrog"; ``wanted_m`` is for the last."""
+    if part == "leapfrog":
+        return Leapfrog(runs, seed, waveforms) if wanted_m is None else Leapfrog(runs, seed, waveforms, wanted_m)
+    return {"detection": Detection, "collision": Collision}[part](runs, seed, waveforms)

@@ -11,6 +11,7 @@ import numpy as np
 
 from sonofix.records import Curve, Finding, Floats, Panel, Sheet
 from sonofix.studies import robots_stops
+from sonofix.studies.robots_planned import Planned
 from sonofix.studies.robots_stops import ROBOTS
 from sonofix.studies.robots_strip import (
     BASE_SD_M,
@@ -33,8 +34,9 @@ from sonofix.studies.robots_strip import (
     wheels_alone,
 )
 from sonofix.studies.work import batches, rms
-from sonofix.team import planner
+from sonofix.team.ahead import Ranging, ahead
 from sonofix.team.leapfrog import Formation, begin
+from sonofix.team.planner import STEPS_M
 
 PUBLISHED = 1.2e-3
 """Error over path of CPS-II (Kurazume & Hirose 2000, Autonomous Robots 8): robots with a laser, ranges and bearings."""
@@ -46,7 +48,7 @@ FEW = 10
 """Of fewer runs, root mean squares and means of squares scatter too much to be held against what is expected."""
 
 PLANNED_SD_M = 0.06
-"""End error that the planner is asked for."""
+"""End error that the planner is asked for, unless told otherwise."""
 
 
 def ratio(miss_m: Floats, covariance_m2: Floats, case: str) -> Finding:
@@ -64,13 +66,12 @@ def _unless_few(claim: str, runs: int) -> str:
 class Leapfrog:
     """The study in progress."""
 
-    def __init__(self, runs: int, seed: int, waveforms: int) -> None:
-        self._wanted, self._seed, self._drives = runs, seed, waveforms
+    def __init__(self, runs: int, seed: int, waveforms: int, planned_m: float = PLANNED_SD_M) -> None:
+        self._wanted, self._seed, self._drives, self._planned_m = runs, seed, waveforms, planned_m
         self._bench = robots_stops.bench(SNR_DB, TONE_DB)
-        self._ranging: planner.Ranging | None = None
+        self._ranging: Ranging | None = None
         self._checked: tuple[Floats, Floats] | None = None
-        self._plan: planner.Plan | None = None
-        self._cases: tuple[Case, ...] = CASES
+        self._planned: Planned | None = None
         self._done: dict[str, list[Run]] = {}
         self._wheels: list[Floats] = []
         self._heard: list[Run] = []
@@ -80,19 +81,18 @@ class Leapfrog:
         """Measure ranges, plan, compute the runs, then those from waveforms."""
         self._ranging, *checked = calibrated(self._bench, self._seed)
         self._checked = (checked[0], checked[1])
-        known = _formation(self._ranging, 0.0)
-        self._plan = planner.plan(known, COURSE, self._ranging, PLANNED_SD_M, WAY_SD)
-        self._cases = (*CASES, Case("as planned", 0.0, None, self._plan.step_m, self._plan.width_m))
+        self._planned = Planned(_formation(self._ranging, 0.0), self._ranging, self._planned_m, self._seed)
         self._scan = _scan(self._ranging)
         for numbers in batches(self._wanted):
-            for k, case in enumerate(self._cases):
+            for k, case in enumerate(CASES):
                 for run in numbers:
                     rng = np.random.default_rng([self._seed, 30, k, run])
                     self._done.setdefault(case.name, []).append(drive(case, stated(self._ranging, rng), rng))
-                    share = (
-                        numbers.start + (k + (run - numbers.start) / len(numbers)) * len(numbers) / 4
-                    ) / self._wanted
-                    yield "by ranges", min(1.0, share)
+                    here = (k + (run - numbers.start) / len(numbers)) / (len(CASES) + 1)
+                    yield "by ranges", (numbers.start + here * len(numbers)) / self._wanted
+            for share in self._planned.work(numbers):
+                here = (len(CASES) + share) / (len(CASES) + 1)
+                yield "by ranges", (numbers.start + here * len(numbers)) / self._wanted
             self._wheels.append(wheels_alone(numbers, self._seed))
             yield "by ranges", numbers.stop / self._wanted
         for number in range(self._drives):
@@ -101,7 +101,8 @@ class Leapfrog:
 
     def sheet(self) -> Sheet | None:
         """Show what is finished."""
-        if self._ranging is None or self._plan is None or any(c.name not in self._done for c in self._cases):
+        planned = self._planned
+        if planned is None or not planned.begun or any(c.name not in self._done for c in CASES):
             return None
         panels = (
             self._along(),
@@ -109,26 +110,26 @@ class Leapfrog:
             self._by_speed(),
             Panel(
                 "What the planner weighs",
-                "speed of sound known; lines by the strip's width",
+                "by the strip's width",
                 "each robot's step along, m",
-                "foreseen end error (1 σ), m",
-                (*self._scan, Curve("asked for", _ENDS_M, np.full(2, PLANNED_SD_M), "bound")),
-                (1e-2, 2.0),
+                "end error (1 σ), m",
+                (*self._scan, Curve("wanted", _ENDS_M, np.full(2, self._planned_m), "bound")),
+                (min(1e-2, self._planned_m / 2), max(2.0, 4 * self._planned_m)),
                 logarithmic=True,
             ),
+            *planned.panels(),
         )
         note = (
             f"three robots go {LENGTH_M:g} m in legs of {LEG_M:g} m; 40 kHz bursts under a tone {TONE_DB:g} dB louder"
         )
-        return Sheet("Robots: leap-frog", note, 2, panels, self._findings())
+        return Sheet("Robots: leap-frog", note, 3, panels, self._findings(planned), (planned.listing(),))
 
-    def _findings(self) -> tuple[Finding, ...]:
+    def _findings(self, planned: Planned) -> tuple[Finding, ...]:
         assert self._checked is not None
-        assert self._plan is not None
         miss, sd = self._checked
         at = f"ranges over {robots_stops.AT_M:g} m, from waveforms"
         out = [rms(miss, at, "rms", "m"), rms(miss / sd, at, "error over its deviation", "1", "1")]
-        for case in self._cases:
+        for case in CASES:
             out += _ends(self._done[case.name], case)
         if self._heard:
             out += _ends(self._heard, Case("from waveforms", SPEED_SD))
@@ -141,11 +142,7 @@ class Leapfrog:
         out.append(
             Finding("0.01 % of the speed of sound", "end error it makes", per_step, None, "m", len(runs), "1 cm")
         )
-        planned = f"planner, asked for {100 * PLANNED_SD_M:g} cm"
-        out += [
-            Finding(planned, "leaps", float(self._plan.leaps), None, "1", 1),
-            Finding(planned, "end error foreseen", self._plan.end_sd_m, None, "m", 1),
-        ]
+        out += planned.findings()
         return tuple(out)
 
     def _along(self) -> Panel:
@@ -160,8 +157,15 @@ class Leapfrog:
         ]
         if self._heard:
             curves.insert(2, Curve("waveforms", *_by_way(self._heard)[:2], "raw"))
-        note = f"{CASES[1].name}; root mean squares over runs"
-        return Panel("Error along the way", note, "way, m", "error, m", tuple(curves), (1e-3, 100.0), logarithmic=True)
+        return Panel(
+            "Error along the way",
+            CASES[1].name,
+            "way, m",
+            "error, rms, m",
+            tuple(curves),
+            (1e-3, 100.0),
+            logarithmic=True,
+        )
 
     def _strip(self) -> Panel:
         """Where robots stood in one run, and what odometry alone would have made of the way."""
@@ -189,19 +193,18 @@ class Leapfrog:
             Curve("0.1 % of path", 100 * sds[[0, -1]], np.full(2, WANTED * LENGTH_M), "bound"),
         ]
         known, doubted, based_found = (_end_rms_m(self._done[case.name]) for case in CASES)
-        x = 100 * SPEED_SD * np.array([0.0, 1.0, 1.0, 1.0])
-        curves.append(Curve("found", x, np.array([known, doubted, np.nan, based_found]), "raw"))
-        note = "a scale error, common to all: it grows with the way"
-        return Panel(
-            "Doubt about the speed of sound", note, "its deviation, %", "end error, m", tuple(curves), (0.0, 0.22)
-        )
+        x = 100 * SPEED_SD * np.array([0.0, 1.0, 1.0])
+        curves.append(Curve("found", x, np.array([known, doubted, based_found]), "points"))
+        note = "it grows with the way"
+        return Panel("Speed of sound in doubt", note, "its deviation, %", "end error, m", tuple(curves), (0.0, 0.22))
 
 
-_ENDS_M = np.array([planner.STEPS_M[0], planner.STEPS_M[-1]])
+_ENDS_M = np.array([STEPS_M[0], STEPS_M[-1]])
 _KINDS = ("alone", "result", "raw")
+_SCAN_M = (7.5, 10.0, 15.0)
 
 
-def _formation(ranging: planner.Ranging, speed_sd: float, base_sd_m: float | None = None) -> Formation:
+def _formation(ranging: Ranging, speed_sd: float, base_sd_m: float | None = None) -> Formation:
     """What is known at the start, by ranges that happen to be right."""
     true = START_M
     pairs = (("K", "R2"), ("K", "R1"), ("R2", "R1"))
@@ -210,19 +213,20 @@ def _formation(ranging: planner.Ranging, speed_sd: float, base_sd_m: float | Non
     return begin(ROBOTS, true, pairs, distance, ranging.covariance_m2(distance), speed_sd, base).formation
 
 
-def _end_sd_m(formation: Formation, ranging: planner.Ranging, step_m: float = LEG_M, width_m: float = WIDTH_M) -> float:
-    """Deviation that the course would end with; NaN where out of reach."""
-    tried = planner.ahead(formation, COURSE, ranging, WAY_SD, step_m, width_m)
-    return np.nan if tried is None else tried[1][-1].sd_m(tried[0][-1][0])
+def _end_sd_m(formation: Formation, ranging: Ranging) -> float:
+    """Deviation that the course would end with."""
+    step, width = np.array([LEG_M]), np.array([WIDTH_M])
+    return float(ahead(formation, COURSE, ranging, WAY_SD, step, width).end_sd_m[0])
 
 
-def _scan(ranging: planner.Ranging) -> list[Curve]:
-    """End errors by step and width."""
-    steps, known = np.array(planner.STEPS_M), _formation(ranging, 0.0)
-    return [
-        Curve(f"{width:g} m", steps, np.array([_end_sd_m(known, ranging, step, width) for step in steps]), kind)
-        for width, kind in zip((7.5, 10.0, 15.0), _KINDS, strict=True)
-    ]
+def _scan(ranging: Ranging) -> list[Curve]:
+    """End errors by step and width; NaN where out of reach."""
+    steps, known = np.array(STEPS_M), _formation(ranging, 0.0)
+
+    def ends(width_m: float) -> Floats:
+        return ahead(known, COURSE, ranging, WAY_SD, steps, np.full(len(steps), width_m)).end_sd_m
+
+    return [Curve(f"{width:g} m", steps, ends(width), kind) for width, kind in zip(_SCAN_M, _KINDS, strict=True)]
 
 
 def _ends(runs: Sequence[Run], case: Case) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,8 +11,9 @@ import numpy as np
 from sonofix.records import Floats
 from sonofix.studies import robots_stops
 from sonofix.studies.robots_stops import ROBOTS, Heard
-from sonofix.team import planner
+from sonofix.team.ahead import MOST_LEAPS, Course, Ranging, hindmost, landing
 from sonofix.team.leapfrog import Formation, Leap, begin, leapt
+from sonofix.team.planner import Plan
 
 LENGTH_M, LEG_M, WIDTH_M = 100.0, 10.0, 10.0
 """Each robot goes 10 m along at a time, 3.3 m past the foremost: triangles of 10.5 m and 6.7 m."""
@@ -81,6 +83,14 @@ class Run:
         Where robots stood, those of the start first.
     again : int
         Stops that had to be ranged anew.
+    robots : tuple of str
+        Who leapt.
+    way_m : float64 (n,)
+        How far each leap was meant to go.
+    farthest_m : float64 (n,)
+        Greatest distance of two robots after each.
+    plans : tuple of Plan
+        What was asked for before each leap; empty where all was set before.
     """
 
     along_m: Floats
@@ -91,22 +101,31 @@ class Run:
     by_scale_m: float
     places_m: Floats
     again: int
+    robots: tuple[str, ...]
+    way_m: Floats
+    farthest_m: Floats
+    plans: tuple[Plan, ...]
 
 
 START_M = np.array([[i * LEG_M / 3, WIDTH_M / 2 * (-1.0, 1.0, -1.0)[i]] for i in range(3)])
 """Places of K, R2 and R1 at the start: as if the strip came from behind."""
 
-COURSE = planner.Course(np.zeros(2), 0.0, LENGTH_M + 2 * LEG_M / 3)
+COURSE = Course(np.zeros(2), 0.0, LENGTH_M + 2 * LEG_M / 3)
 """Straight on, 100 m for R1, the foremost."""
 
 
-def drive(case: Case, ears: Ears, rng: np.random.Generator) -> Run:
+def drive(case: Case, ears: Ears, rng: np.random.Generator, ask: Callable[[Formation], Plan] | None = None) -> Run:
     """Do one run.
+
+    Parameters
+    ----------
+    ask : callable, optional
+        Tells each leap by what is known before it; else the hindmost leaps, by the case's strip.
 
     Raises
     ------
     RuntimeError
-        If a stop yields no place in `TRIES` attempts.
+        If a stop yields no place in `TRIES` attempts, a plan none at all, or the end is not reached in `MOST_LEAPS`.
     """
     true = START_M.copy()
     scale = case.speed_sd * float(rng.standard_normal())
@@ -121,33 +140,54 @@ def drive(case: Case, ears: Ears, rng: np.random.Generator) -> Run:
         raise RuntimeError(f"the start: {found.remedy}")
     now, again, arrived = found.formation, 0, False
     along, miss, spread, places = [], [], [], [*true.copy()]
-    robot = planner.hindmost(now, COURSE)
+    robots: list[str] = []
+    ways: list[float] = []
+    farthest: list[float] = []
+    plans: list[Plan] = []
     while not arrived:
-        robot = planner.hindmost(now, COURSE)
-        who = now.index(robot)
-        to_m = planner.landing(now, robot, COURSE, case.step_m, case.width_m)
-        # the last leap is the one that is meant to end there
-        arrived = bool(COURSE.along_and_across(to_m)[0] >= COURSE.length_m - 1e-6)
+        if len(robots) == MOST_LEAPS:
+            raise RuntimeError(f"the end is not reached in {MOST_LEAPS} leaps")
+        if ask is not None:
+            plans.append(ask(now))
+            if plans[-1].status == "unreachable":
+                raise RuntimeError(f"after {len(robots)} leaps: {plans[-1].remedy}")
+            robot, to_m = plans[-1].robot, plans[-1].place_m
+            who = now.index(robot)
+        else:
+            robot = hindmost(now, COURSE)
+            who = now.index(robot)
+            (to_m,) = landing(
+                now.place_m[None], np.array([who]), COURSE, np.array([case.step_m]), np.array([case.width_m])
+            )
         meant = to_m - now.place_m[who]
-        way_sd = WAY_SD * float(np.hypot(*meant))
-        true[who] += meant + way_sd * rng.standard_normal(2)
-        leap, tries = _leapt(now, robot, meant, way_sd, ears, true, scale)
+        way_m = float(np.hypot(*meant))
+        true[who] += meant + WAY_SD * way_m * rng.standard_normal(2)
+        leap, tries = _leapt(now, robot, meant, WAY_SD * way_m, ears, true, scale)
         if leap.status != "ok":
             raise RuntimeError(f"{robot} after {len(along)} leaps: {leap.remedy}")
         now, again = leap.formation, again + tries - 1
+        # the last leap is the one that is meant to end there, or one that is past it by chance
+        arrived = COURSE.arrived(to_m) or COURSE.arrived(now.place_m[who])
         along.append(float(now.place_m[who, 0]))
         miss.append(now.place_m[who] - true[who])
         spread.append(now.covariance_m2(robot))
         places.append(true[who].copy())
+        robots.append(robot)
+        ways.append(way_m)
+        farthest.append(float(np.hypot(*(true - true[:, None]).T).max()))
     return Run(
         along_m=np.array(along),
         miss_m=np.array(miss),
         covariance_m2=np.array(spread),
         scale_miss=now.scale - scale,
         scale_sd=now.scale_sd,
-        by_scale_m=float(np.hypot(*now.by_scale_m(robot))),
+        by_scale_m=float(np.hypot(*now.by_scale_m(robots[-1]))),
         places_m=np.array(places),
         again=again,
+        robots=tuple(robots),
+        way_m=np.array(ways),
+        farthest_m=np.array(farthest),
+        plans=tuple(plans),
     )
 
 
@@ -164,7 +204,7 @@ def _leapt(
     return leapt(now, robot, meant, way_sd**2 * np.eye(2), heard.pairs, heard.range_m, heard.covariance_m2), TRIES
 
 
-def stated(ranging: planner.Ranging, rng: np.random.Generator) -> Ears:
+def stated(ranging: Ranging, rng: np.random.Generator) -> Ears:
     """Ears that draw ranges of a stated covariance."""
     pairs = (("K", "R2"), ("K", "R1"), ("R2", "R1"))
 
@@ -188,14 +228,14 @@ def heard_run(bench: robots_stops.Bench, number: int, seed: int) -> Run:
     return drive(CASES[1], hearing(bench, rng), rng)
 
 
-def calibrated(bench: robots_stops.Bench, seed: int) -> tuple[planner.Ranging, Floats, Floats]:
+def calibrated(bench: robots_stops.Bench, seed: int) -> tuple[Ranging, Floats, Floats]:
     """Measure how well robots range each other 10 m apart: the model, and errors (stops, 3) and stated deviations."""
     place = robots_stops.AT_M * np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])
     heard = [robots_stops.stop(bench, place, 0.0, (seed, 32, k)) for k in range(BENCH_STOPS)]
     whole = [h for h in heard if len(h.pairs) == 3]
     miss = np.array([h.range_m - robots_stops.AT_M for h in whole])
     sd = np.sqrt(np.array([np.diag(h.covariance_m2) for h in whole]))
-    model = planner.Ranging(
+    model = Ranging(
         float(np.sqrt(np.mean(sd**2))), robots_stops.AT_M, robots_stops.ABSORPTION_DB_PER_M, robots_stops.REACH_M
     )
     return model, miss, sd

@@ -272,21 +272,6 @@ def opened(formation: Formation, robot: str, moved_m: Floats, moved_covariance_m
     return replace(formation, place_m=place, covariance=covariance)
 
 
-def foreseen(
-    formation: Formation,
-    robot: str,
-    moved_m: Floats,
-    moved_covariance_m2: Floats,
-    pairs: Sequence[Pair],
-    covariance_m2: Floats,
-) -> Formation:
-    """Return what would be known after a leap as planned, ranges of a covariance being taken: nothing is measured."""
-    aged = opened(formation, robot, moved_m, moved_covariance_m2)
-    state = np.append(aged.place_m.ravel(), aged.scale)
-    _, derivative = _expected(aged, state, pairs)
-    return replace(aged, covariance=_corrected(aged.covariance, derivative, np.asarray(covariance_m2, float))[1])
-
-
 def _updated(formation: Formation, pairs: Sequence[Pair], range_m: Floats, noise_m2: Floats, start_m: Floats) -> Leap:
     """Do an iterated Kalman update, linearised first at ``start_m`` (Bell & Cathey 1993: Gauss-Newton)."""
     heard, noise = np.asarray(range_m, np.float64), np.asarray(noise_m2, np.float64)
