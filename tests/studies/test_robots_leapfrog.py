@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonofix.records import Finding, Sheet
+from sonofix.records import Finding, Floats, Sheet
 from sonofix.studies import begin, robots_leapfrog, robots_stops, robots_strip
 
 RUNS = 40
@@ -90,12 +90,12 @@ def test_leaps_are_listed_one_by_one(sheet: Sheet) -> None:
     assert rows[-1]["leaps_left"] == 0
     assert rows[-1]["end_sd_m"] == rows[-1]["sd_m"]
     # each goes as far as from where it stood last, to the deviation with which it lands (5 σ of 5 %)
-    stood = dict(zip(robots_stops.ROBOTS, robots_strip.START_M, strict=True))
+    stood: dict[str | int | float, Floats] = dict(zip(robots_stops.ROBOTS, robots_strip.START_M, strict=True))
     for row in rows:
         place = np.array([row["x_m"], row["y_m"]], float)
-        went = float(np.hypot(*(place - stood[str(row["robot"])])))
+        went = float(np.hypot(*(place - stood[row["robot"]])))
         assert float(row["way_m"]) == pytest.approx(went, rel=5 * robots_strip.WAY_SD)
-        stood[str(row["robot"])] = place
+        stood[row["robot"]] = place
     assert listing.note.startswith("6 cm wanted; foreseen at the start: ")
 
 

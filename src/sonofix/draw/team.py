@@ -1,4 +1,8 @@
-"""The picture of a team: all tracks with ellipses, how sure each robot was, and who stood while who moved."""
+"""The picture of a team: all tracks with ellipses, how sure each robot was, and who stood while who moved.
+
+A long recording's tracks cover each other: then all are shown of its last minute, and each robot's whole track by
+itself.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +14,20 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from sonofix.draw import style
+from sonofix.draw.team_times import draw_times
 from sonofix.records import Estimate, Floats, Recording, Step, Truth
-
-STANDING_MPS = 0.01
-"""A lower speed is rest."""
 
 ELLIPSES = 14
 """Along each track."""
 
-ALONE_S = 2.0
-"""A robot of which nothing was taken for longer is carried by its odometry alone."""
+LATEST_S = 60.0
+"""A longer recording is too much for one plan: that shows so much of its end."""
 
-ROLES = {"explores": (0.62, 1.0), "base": (0.16, 1.0), "alone": (0.62, 0.22)}
-"""Height and opacity of the bars of each role."""
+_AREA = (0.05, 0.07, 0.56, 0.80)
+"""Of plans: left, bottom, width, height."""
+
+_FRAME = (0.035, 0.065)
+"""Room beside each plan and above it, for labels."""
 
 
 def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, Truth] | None = None) -> Figure:
@@ -50,28 +55,19 @@ def draw_team(recording: Recording, steps: Sequence[Step], truths: Mapping[str, 
         if not tracks:
             figure.text(0.5, 0.5, "no robot was placed", fontsize=20, color=style.MUTED, ha="center", va="center")
             return figure
-        plan = figure.add_axes((0.05, 0.08, 0.54, 0.80))
-        draw_landmarks(plan, recording)
-        for name, track in tracks.items():
-            colour = colours[name]
-            if name in truths and len(track):
-                true = truths[name].position_m
-                plan.plot(true[:, 0], true[:, 1], color=style.TRUTH, linewidth=0.6, alpha=0.5, zorder=2)
-            place = places(track)
-            plan.plot(*place.T, color=colour, linewidth=1.1, label=name, zorder=3)
-            for estimate in track[:: max(1, len(track) // ELLIPSES)]:
-                plan.add_patch(ellipse(estimate, colour))
-        plan.set_aspect("equal")
-        _limits(plan, recording, tracks)
-        style.dress(plan, "Tracks", "ellipses: three deviations" + ("; fine: truth" if truths else ""))
-        plan.set_xlabel("x (m)")
-        plan.set_ylabel("y (m)")
-        plan.legend(loc="upper right", fontsize=10)
-        error = figure.add_axes((0.66, 0.50, 0.32, 0.38))
-        _draw_doubt(error, tracks, truths, colours)
-        roles = figure.add_axes((0.66, 0.08, 0.32, 0.33), sharex=error)
-        _draw_roles(roles, recording, steps, tracks, colours)
-        roles.set_xlabel("time (s)")
+        begin = min(track[0].time_s for track in tracks.values())
+        end = max(track[-1].time_s for track in tracks.values())
+        limits = _limits(recording, tracks)
+        if end - begin <= LATEST_S:
+            plan = figure.add_axes(_box(0, 1, 1))
+            _draw_plan(plan, recording, tracks, truths, colours, limits)
+            style.dress(plan, "Tracks", "ellipses: three deviations" + ("; fine: truth" if truths else ""))
+            plan.set_xlabel("x (m)")
+            plan.set_ylabel("y (m)")
+            plan.legend(loc="upper right", fontsize=10)
+        else:
+            _draw_plans(figure, recording, tracks, truths, colours, limits, end)
+        draw_times(figure, (0.66, 0.07, 0.32, 0.80), recording, steps, tracks, truths, colours)
     return figure
 
 
@@ -107,98 +103,94 @@ def draw_landmarks(axes: Axes, recording: Recording) -> None:
         axes.plot(*fixed.T, "^", color=style.MUTED, markersize=6, zorder=4, label="landmarks")
 
 
-def _limits(axes: Axes, recording: Recording, tracks: Mapping[str, Sequence[Estimate]]) -> None:
-    """Show where the robots were, and no ellipse that leaves the hall."""
-    every = [places(track) for track in tracks.values()]
-    every += [np.array([b.position_m[:2]]) for b in recording.site.beacons if b.position_m is not None]
-    if not every:
-        return
-    points = np.vstack(every)
-    low, high = np.percentile(points, 0.5, axis=0), np.percentile(points, 99.5, axis=0)
+def _limits(recording: Recording, tracks: Mapping[str, Sequence[Estimate]]) -> tuple[Floats, Floats]:
+    """Show where the robots were, and no ellipse that leaves the hall: least and greatest (2,)."""
+    points = np.vstack([places(track) for track in tracks.values()])
+    fixed = [np.array(beacon.position_m[:2]) for beacon in recording.site.beacons if beacon.position_m is not None]
+    low = np.min([np.percentile(points, 0.5, axis=0), *fixed], axis=0)
+    high = np.max([np.percentile(points, 99.5, axis=0), *fixed], axis=0)
     margin = 0.08 * float(np.max(high - low)) + 0.1
-    axes.set_xlim(low[0] - margin, high[0] + margin)
-    axes.set_ylim(low[1] - margin, high[1] + margin)
+    return low - margin, high + margin
 
 
-def _draw_doubt(
-    axes: Axes, tracks: Mapping[str, Sequence[Estimate]], truths: Mapping[str, Truth], colours: Mapping[str, str]
+def _box(cell: int, columns: int, rows: int) -> tuple[float, float, float, float]:
+    """Where one of so many plans goes: left, bottom, width, height."""
+    left, bottom, width, height = _AREA
+    row, column = divmod(cell, columns)
+    wide, high = width / columns, height / rows
+    x, y = left + column * wide, bottom + (rows - 1 - row) * high
+    return x, y, wide - _FRAME[0], high - (_FRAME[1] if rows > 1 else 0.0)
+
+
+def _grid(count: int, limits: tuple[Floats, Floats]) -> tuple[int, int]:
+    """Columns and rows in which plans are drawn at the largest scale."""
+    wide, high = limits[1] - limits[0]
+
+    def scale(columns: int) -> float:
+        rows = -(-count // columns)
+        _, _, width, height = _box(0, columns, rows)
+        return min(width * style.SIZE_IN[0] / float(wide), height * style.SIZE_IN[1] / float(high))
+
+    columns = max(range(1, count + 1), key=scale)
+    return columns, -(-count // columns)
+
+
+def _draw_plans(
+    figure: Figure,
+    recording: Recording,
+    tracks: Mapping[str, Sequence[Estimate]],
+    truths: Mapping[str, Truth],
+    colours: Mapping[str, str],
+    limits: tuple[Floats, Floats],
+    end_s: float,
 ) -> None:
+    """Draw the last minute of all, and the whole track of each."""
+    latest = {name: [e for e in track if e.time_s >= end_s - LATEST_S] for name, track in tracks.items()}
+    cells = [(f"Last {LATEST_S:g} s", latest), *((name, {name: track}) for name, track in tracks.items())]
+    columns, rows = _grid(len(cells), limits)
+    for cell, (title, shown) in enumerate(cells):
+        plan = figure.add_axes(_box(cell, columns, rows))
+        _draw_plan(plan, recording, shown, truths, colours, limits, ends=cell == 0)
+        style.dress(plan, title, "" if cell else "all robots")
+        if cell:
+            plan.set_title(title, loc="left", color=colours[title], fontsize=11.5, fontweight="bold", pad=7)
+        if cell // columns == rows - 1:
+            plan.set_xlabel("x (m)")
+        if cell % columns == 0:
+            plan.set_ylabel("y (m)")
+    told = "ellipses: three deviations; triangles: landmarks" + ("; fine: truth" if truths else "")
+    figure.text(_AREA[0], 0.902, told, fontsize=10, color=style.MUTED, va="center")
+
+
+def _draw_plan(
+    plan: Axes,
+    recording: Recording,
+    tracks: Mapping[str, Sequence[Estimate]],
+    truths: Mapping[str, Truth],
+    colours: Mapping[str, str],
+    limits: tuple[Floats, Floats],
+    ends: bool = False,
+) -> None:
+    """Draw tracks, their truth and ellipses; with ``ends`` a dot and a name where each robot is at last."""
+    draw_landmarks(plan, recording)
     for name, track in tracks.items():
-        time = np.array([estimate.time_s for estimate in track])
-        sd = np.array([np.hypot(estimate.sd("x") or 0.0, estimate.sd("y") or 0.0) for estimate in track])
-        axes.plot(time, sd, color=colours[name], linewidth=0.9, alpha=0.9)
+        if not track:
+            continue
         if name in truths:
             truth = truths[name]
-            inside = (time >= truth.time_s[0]) & (time <= truth.time_s[-1])
-            true = np.column_stack([np.interp(time, truth.time_s, truth.position_m[:, i]) for i in range(2)])
-            off = np.where(inside, np.hypot(*(places(track) - true).T), np.nan)
-            axes.plot(time, off, ".", color=colours[name], markersize=1.2, alpha=0.5)
-    axes.set_yscale("log")
-    axes.tick_params(labelbottom=False)
-    axes.set_ylabel("m")
-    style.dress(axes, "Deviation of position", "dots: error against the truth" if truths else "")
-
-
-def roles_of(
-    recording: Recording, steps: Sequence[Step], name: str, time_s: Floats, moves: Sequence[bool]
-) -> list[str]:
-    """Return what a vehicle did at each of its estimates.
-
-    ``explores``: it moved, and others heard it or it heard; ``base``: it stood, and did; ``alone``: nothing was
-    taken of it for `ALONE_S`, so its odometry alone carried it.
-    """
-    nodes = {node.id for node in (*recording.site.beacons, *recording.site.microphones) if node.vehicle == name}
-    nodes.add(name)
-    told = [
-        step.ranges.sync_s
-        for step in steps
-        if any(e.vehicle == name and e.source in ("fused", "fix") for e in step.estimates)
-        or any(
-            used and (emitter in nodes or receiver in nodes)
-            for used, emitter, receiver in zip(
-                np.asarray(step.range_used, bool).tolist(), step.ranges.emitter, step.ranges.receiver, strict=True
+            true = truth.position_m[(truth.time_s >= track[0].time_s) & (truth.time_s <= track[-1].time_s)]
+            plan.plot(true[:, 0], true[:, 1], color=style.TRUTH, linewidth=0.6, alpha=0.5, zorder=2)
+        place = places(track)
+        plan.plot(*place.T, color=colours[name], linewidth=1.1, label=name, zorder=3)
+        for estimate in track[:: max(1, len(track) // ELLIPSES)] if not ends else track[-1:]:
+            plan.add_patch(ellipse(estimate, colours[name]))
+        if ends:
+            plan.plot(*place[-1], "o", color=colours[name], markersize=5, zorder=5)
+            at, colour = (float(place[-1, 0]), float(place[-1, 1])), colours[name]
+            plan.annotate(
+                name, at, xytext=(5, 5), textcoords="offset points", color=colour, fontsize=9, path_effects=style.HALO
             )
-        )
-    ]
-    at = np.searchsorted(told, time_s + 1e-9) - 1
-    since = np.where(at >= 0, time_s - np.array([-np.inf, *told])[at + 1], np.inf)
-    return [
-        "alone" if gap > ALONE_S else "explores" if moving else "base" for gap, moving in zip(since, moves, strict=True)
-    ]
-
-
-def _draw_roles(
-    axes: Axes,
-    recording: Recording,
-    steps: Sequence[Step],
-    tracks: Mapping[str, Sequence[Estimate]],
-    colours: Mapping[str, str],
-) -> None:
-    """One lane a robot: what it did over time, and when it slipped."""
-    for lane, (name, track) in enumerate(tracks.items()):
-        time = np.array([estimate.time_s for estimate in track])
-        moves = [bool(np.hypot(*estimate.velocity_mps[:2]) > STANDING_MPS) for estimate in track]
-        roles = np.array(roles_of(recording, steps, name, time, moves))
-        apart = np.concatenate([np.diff(time) > 5.0, [True]])
-        changes = np.flatnonzero(
-            np.concatenate([[True], roles[1:] != roles[:-1]]) | np.concatenate([[True], apart[:-1]])
-        )
-        for a, b in zip(changes, [*changes[1:], len(time)], strict=True):
-            end = time[b] if b < len(time) and not apart[b - 1] else time[b - 1]
-            height, alpha = ROLES[roles[a]]
-            axes.broken_barh(
-                [(time[a], max(end - time[a], 1e-3))],
-                (lane - height / 2, height),
-                color=colours[name],
-                alpha=alpha,
-                linewidth=0,
-            )
-        slips = [
-            event.time_s for step in steps for event in step.events if event.vehicle == name and event.event == "slip"
-        ]
-        if slips:
-            axes.plot(slips, [lane] * len(slips), "x", color=style.EXCLUDED, markersize=8, markeredgewidth=2, zorder=5)
-    axes.set_yticks(range(len(tracks)), list(tracks))
-    axes.set_ylim(len(tracks) - 0.4, -0.6)
-    style.dress(axes, "Roles", "thick: explores; thin: base; faint: unheard; ×: pushed")
-    axes.grid(False, axis="y")
+    (left, low), (right, high) = limits
+    plan.set_aspect("equal")
+    plan.set_xlim(left, right)
+    plan.set_ylim(low, high)
