@@ -50,7 +50,9 @@ def test_a_long_recording_shows_its_last_minute_and_each_robot_alone(long_team: 
     assert [axes.get_title("left") for axes in plans] == [f"Last {LATEST_S:g} s", *NAMES]
     end = max(e.time_s for step in long_team.steps for e in step.estimates)
     for axes in plans:
-        drawn = {line.get_label(): len(line.get_xdata()) for line in axes.lines if line.get_label() in NAMES}
+        drawn = {
+            line.get_label(): len(np.asarray(line.get_xdata())) for line in axes.lines if line.get_label() in NAMES
+        }
         title = axes.get_title("left")
         since = end - LATEST_S if title not in NAMES else 0.0
         shown = NAMES if title not in NAMES else (title,)

@@ -139,7 +139,8 @@ def test_panels_show_growth_and_places(sheet: Sheet) -> None:
     assert next(curve.kind for curve in speed.curves if curve.name == "found") == "points"
     assert weighed.logarithmic
     once, anew, wanted = plans.curves
-    assert once.y[0] == anew.y[0] <= wanted.y[0]
+    assert once.y[0] == pytest.approx(anew.y[0], rel=0.01)
+    assert anew.y[0] <= wanted.y[0]
     # asked anew, what a plan has to spare is spent on longer leaps
     assert np.nanmedian(once.y) < np.nanmedian(anew.y) < np.nanmax(anew.y) < 1.05 * wanted.y[0]
     by_name = {curve.name: curve for curve in reached.curves}

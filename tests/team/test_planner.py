@@ -81,7 +81,7 @@ def test_plans_asked_anew_after_each_leap_reach_what_is_wanted(wanted: float) ->
     assert 0.75 * wanted < np.sqrt(np.mean(stated**2)) <= wanted
     found = np.sqrt(np.mean([run.miss_m[-1] @ run.miss_m[-1] for run in runs]))
     assert found < wanted * (1 + 4 / np.sqrt(2 * n))
-    assert all(len(run.plans) == len(run.robots) and run.plans[-1].leaps == 1 for run in runs)
+    assert all(len(run.plans) == len(run.robots) for run in runs)
     # all were told to stay within reach of each other, whatever odometry does
     assert max(run.farthest_m.max() for run in runs) <= RANGING.reach_m
 

@@ -31,19 +31,21 @@ class Planned:
         self._ranging, self._seed = ranging, seed
         self.wanted_m = [share * wanted_m for share in SHARES]
         self.first = [self._asked(start, wanted) for wanted in self.wanted_m]
-        self._done: list[list[Run]] = [[] for _ in SHARES]
+        # for shares out of reach there is nothing to tell but for what was asked
+        self._kept_shares = [k for k, first in enumerate(self.first) if k == 0 or first.status == "ok"]
+        self._done: dict[int, list[Run]] = {k: [] for k in self._kept_shares}
         self._once: list[Run] = []
 
     @property
     def begun(self) -> bool:
         """Whether each share has a run."""
-        return all(self._done) and bool(self._once)
+        return all(self._done.values()) and bool(self._once)
 
     def work(self, numbers: range) -> Iterator[float]:
         """Do runs, and yield the share of them that is done."""
         fewer = [number for number in numbers if number % FEWER == 0]
         todo = [(-1, number) for number in numbers] + [(0, number) for number in numbers]
-        todo += [(k, number) for k in range(1, len(SHARES)) for number in fewer]
+        todo += [(k, number) for k in self._kept_shares[1:] for number in fewer]
         for count, (k, number) in enumerate(todo, 1):
             rng = np.random.default_rng([self._seed, 34, k + 1, number])
             ears, case = stated(self._ranging, rng), Case("planned", 0.0)
@@ -74,7 +76,7 @@ class Planned:
             _mean([float(len(run.robots)) for run in runs], case, "leaps"),
             self._apart(runs, case),
         ]
-        for k in np.argsort(SHARES):
+        for k in self._by_share():
             if k:
                 case = f"planned anew, for {_text(self.wanted_m[k])}"
                 out.append(rms(_ends(self._done[k]), case, "end error, rms", "m", self._claim(k)))
@@ -120,7 +122,7 @@ class Planned:
         limits = (0.9 * float(low), float(high) + 0.5 * float(high - low) + 0.05 * wanted_m)
         note = f"as then expected, {min(DRAWN, len(self._once))} runs each"
         leaps = Panel("Plans leap by leap", note, "way, m", "end error (1 σ), m", curves, limits)
-        order = np.argsort(SHARES)
+        order = self._by_share()
         x = np.array(self.wanted_m)[order]
         reached = np.array([np.sqrt(np.mean(_ends(self._done[k]) ** 2)) for k in order])
         told = np.array([np.sqrt(np.mean(_variances(self._done[k]))) for k in order])
@@ -132,6 +134,10 @@ class Planned:
             Curve("planned once", np.array(self.wanted_m[:1]), planned_once, "raw"),
         )
         return leaps, Panel("Wanted and reached", "rms over runs", "end error wanted, m", "end error, m", kept)
+
+    def _by_share(self) -> list[int]:
+        """Shares in rising order."""
+        return sorted(self._kept_shares, key=SHARES.__getitem__)
 
     def _apart(self, runs: Sequence[Run], case: str) -> Finding:
         """How many stops a run leave two robots where they cannot hear each other."""
