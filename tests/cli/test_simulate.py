@@ -259,3 +259,19 @@ def test_the_site_file_itself_is_never_rewritten(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "holds the site file itself" in result.stderr
     assert (tmp_path / "site.toml").read_text() == SITE
+
+
+def test_odometry_is_written_where_it_is_asked_for_and_again_with_force(site: Path, tmp_path: Path) -> None:
+    words = ["simulate", str(site), str(tmp_path / "o"), "--motion", "line:2,2,0.5,0", *QUICK, "--odometry", "0"]
+    for more in ([], ["--force"]):
+        told = CliRunner().invoke(app, [*words, *more])
+        assert told.exit_code == 0, told.output
+    columns = read_recording(tmp_path / "o").tables["odometry"].columns
+    np.testing.assert_allclose(columns["v_mps"], 0.5)
+    np.testing.assert_allclose(columns["time_s"], np.arange(5) / 10)
+    # without, samples of another drive would not fit it
+    told = CliRunner().invoke(app, [*words[:-2], "--force"])
+    assert told.exit_code == 2
+    assert "odometry.csv" in told.stderr
+    told = CliRunner().invoke(app, [*words[:2], str(tmp_path / "n"), *words[3:-1], "2"])
+    assert "below 1" in told.stderr

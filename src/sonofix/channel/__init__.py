@@ -4,6 +4,7 @@ from sonofix.channel.levels import direct_gains, level_below, noise_for_snr
 from sonofix.channel.motion import Circle, Line, Motion, Poses, Sampled, Still
 from sonofix.channel.simulate import Tone, simulate
 from sonofix.channel.waypoints import Waypoints
+from sonofix.channel.wheels import odometry_of
 
 __all__ = [
     "Circle",
@@ -17,5 +18,6 @@ __all__ = [
     "direct_gains",
     "level_below",
     "noise_for_snr",
+    "odometry_of",
     "simulate",
 ]

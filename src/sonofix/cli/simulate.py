@@ -26,7 +26,9 @@ Repeat it for several vehicles."""
 
 def simulate(
     site: Annotated[Path, typer.Argument(help="Site file (site.toml): what stands where, what it sends, what moves.")],
-    out: Annotated[Path, typer.Argument(help="Folder to write: site.toml, capture.wav, truth.csv (and sync.csv).")],
+    out: Annotated[
+        Path, typer.Argument(help="Folder to write: site.toml, capture.wav, truth.csv (and sync.csv, odometry.csv).")
+    ],
     motion: Annotated[list[str] | None, typer.Option(help=MOTION_HELP)] = None,
     vehicle: Annotated[
         list[str] | None, typer.Option(help="Vehicle that a --motion is of, one for each, in the same order.")
@@ -76,6 +78,13 @@ def simulate(
     sync_jitter: Annotated[
         float, typer.Option(help="Standard deviation in s of sync commands; sync.csv tells when they came.")
     ] = 0.0,
+    odometry: Annotated[
+        float | None,
+        typer.Option(
+            help="Write odometry.csv as well, off by such a share: 0.02 is a lasting error of 2 % (1 σ) of speed and "
+            "yaw rate, and noise that makes as much of a second's way."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same noise.")] = 0,
     flac: Annotated[bool, typer.Option("--flac", help="Write capture.flac: smaller, at most 8 channels.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a recording that is there already.")] = False,
@@ -96,7 +105,7 @@ def simulate(
         raise ValueError("--snr and --noise-db both set the noise; give one of them")
     plan = files.read_site(site)
     references = files.read_references(site.parent, plan)
-    _check_folder(site, out, force)
+    _check_folder(site, out, force, () if odometry is None else ("odometry",))
     motions = _motions(plan, motion or [], vehicle or [], z)
     waveforms = _waveforms(plan, references)
     recording, truth = _made(
@@ -115,6 +124,13 @@ def simulate(
         clocks=_clocks(plan, clock or [], seed),
         seed=seed,
     )
+    if odometry is not None:
+        from dataclasses import replace
+
+        from sonofix.channel import odometry_of
+
+        told = odometry_of(motions, duration, odometry, seed)
+        recording = replace(recording, tables={**recording.tables, "odometry": told})
     _write(out, recording, truth, references, flac, force)
     heard = sum(m.channel is not None for m in plan.microphones)
     typer.echo(
@@ -123,8 +139,8 @@ def simulate(
     )
 
 
-def _check_folder(site: Path, out: Path, force: bool) -> None:
-    """Refuse to write over the site file itself, or beside sensor files that another run measured."""
+def _check_folder(site: Path, out: Path, force: bool, made: tuple[str, ...]) -> None:
+    """Refuse to write over the site file itself, or beside sensor files that another run measured (not ``made``)."""
     if site.resolve() == (out / "site.toml").resolve():
         raise ValueError(f"{out}: holds the site file itself, which would be rewritten; write to another folder")
     if (out / "site.toml").exists():
@@ -132,7 +148,8 @@ def _check_folder(site: Path, out: Path, force: bool) -> None:
             raise ValueError(f"{out}: is a recording already; write to another folder, or give --force to replace it")
         from sonofix.files.recording import SENSOR_FILES
 
-        others = [f"{stem}.csv" for stem in ("ranges", *SENSOR_FILES) if (out / f"{stem}.csv").exists()]
+        stems = [stem for stem in ("ranges", *SENSOR_FILES) if stem not in made]
+        others = [f"{stem}.csv" for stem in stems if (out / f"{stem}.csv").exists()]
         if others:
             raise ValueError(f"{out}: holds {', '.join(others)}, which would not fit new samples; move it away first")
 
