@@ -118,6 +118,23 @@ def test_site_files_shown_are_right(page, tmp_path):
         assert read_site(path).beacons
 
 
+def test_the_team_made_up_is_one_that_the_simulator_takes(tmp_path, monkeypatch):
+    """The commands of docs/team.md, of a second and a half."""
+    page = ROOT / "docs" / "team.md"
+    monkeypatch.chdir(tmp_path)
+    exec(compile(blocks(page, "python")[0], page.name, "exec"), {"__name__": "reader"})
+    simulate, copy, team = blocks(page, "sh")[0].splitlines()
+    assert copy == "cp start.csv leaps/"
+    words = simulate.replace("docs/leaps.toml", str(ROOT / "docs" / "leaps.toml")).split()[1:]
+    words[words.index("--duration") + 1] = "1.5"
+    made = CliRunner().invoke(app, words)
+    assert made.exit_code == 0, made.output
+    (tmp_path / "leaps" / "start.csv").write_bytes((tmp_path / "start.csv").read_bytes())
+    told = CliRunner().invoke(app, [*team.split()[1:], "--no-plot"])
+    assert told.exit_code == 0, told.output
+    assert "never" not in told.stdout
+
+
 def test_site_file_codes_shown_in_lines_are_right(tmp_path):
     text = (ROOT / "docs" / "formats.md").read_text("utf-8")
     codes = re.findall(r"^\| `(\{.+?\})` \|", text, re.MULTILINE)
@@ -157,7 +174,7 @@ def test_rooms_named_exist_and_existing_rooms_are_named():
     assert named == there
 
 
-@pytest.mark.parametrize(("name", "most"), [("track.png", 600_000), ("explain.png", 250_000)])
+@pytest.mark.parametrize(("name", "most"), [("track.png", 600_000), ("explain.png", 250_000), ("team.png", 150_000)])
 def test_the_pictures_are_there_and_small(name, most):
     picture = ROOT / "docs" / name
     assert picture.read_bytes().startswith(b"\x89PNG")
