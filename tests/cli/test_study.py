@@ -173,3 +173,23 @@ def test_mistakes_are_lines(tmp_path: Path) -> None:
 )
 def test_figures_read_well(value: float, sd: float | None, unit: str, text: str) -> None:
     assert found_text(Finding("c", "q", value, sd, unit, 3)) == text
+
+
+def test_a_wanted_end_error_is_planned_leap_by_leap(tmp_path: Path) -> None:
+    words = ("robots", "--part", "leapfrog", "--wanted-m", 0.08, "--runs", 1, "--waveforms", 0, "--no-plot")
+    told = ask(*words, "-o", tmp_path / "l")
+    assert "8 cm wanted; foreseen at the start: " in told
+    with (tmp_path / "l" / "leaps.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    columns = ["leap", "robot", "way_m", "x_m", "y_m", "step_m", "width_m", "sd_m", "end_sd_m", "left"]
+    assert list(rows[0]) == columns
+    assert 0.0 < float(rows[-1]["end_sd_m"]) < 1.05 * 0.08
+    # each row stands in the table as well, whole on a narrow screen
+    shown = [line.split() for line in told.splitlines()]
+    assert columns[1:] in shown
+    for row in rows:
+        (line,) = [words for words in shown if words[:2] == [row["leap"], row["robot"]]]
+        assert [float(word) for word in line[2:]] == pytest.approx([float(row[c]) for c in columns[2:]], abs=0.0051)
+    refused = CliRunner().invoke(app, ["study", "robots", "--part", "collision", "--wanted-m", "0.05"])
+    assert refused.exit_code == 2
+    assert refused.stderr.strip() == "wanted_m 0.05: only study robots, part leapfrog plans for an end error"

@@ -26,7 +26,7 @@ def one(number: int) -> leapfrog.Run:
     return leapfrog.heard_run(robots_stops.bench(leapfrog.SNR_DB, leapfrog.TONE_DB), number, 17)
 
 
-def drawn(number: int, ranging: leapfrog.planner.Ranging) -> leapfrog.Run:
+def drawn(number: int, ranging: leapfrog.Ranging) -> leapfrog.Run:
     rng = np.random.default_rng([17, 41, number])
     return leapfrog.drive(leapfrog.CASES[1], leapfrog.stated(ranging, rng), rng)
 

@@ -87,7 +87,7 @@ def test_leaps_are_listed_one_by_one(sheet: Sheet) -> None:
     rows = [dict(zip(listing.columns, row, strict=True)) for row in listing.rows]
     assert [row["leap"] for row in rows] == list(range(1, len(rows) + 1))
     assert {row["robot"] for row in rows} == set(robots_stops.ROBOTS)
-    assert rows[-1]["leaps_left"] == 0
+    assert rows[-1]["left"] == 0
     assert rows[-1]["end_sd_m"] == rows[-1]["sd_m"]
     # each goes as far as from where it stood last, to the deviation with which it lands (5 σ of 5 %)
     stood: dict[str | int | float, Floats] = dict(zip(robots_stops.ROBOTS, robots_strip.START_M, strict=True))

@@ -103,8 +103,8 @@ def _tell(sheet: Sheet) -> None:
 
 
 def cell_text(cell: str | float) -> str:
-    """Write a cell of a listing: four decimals where it is no whole number."""
-    return f"{cell:.4f}" if isinstance(cell, float) else str(cell)
+    """Write a cell of a listing, to the centimetre, or below 1 to a tenth of a millimetre."""
+    return str(cell) if not isinstance(cell, float) else f"{cell:.2f}" if abs(cell) >= 1 else f"{cell:.4f}"
 
 
 def found_text(finding: Finding) -> str:

@@ -32,8 +32,8 @@ class Planned:
         self.wanted_m = [share * wanted_m for share in SHARES]
         self.first = [self._asked(start, wanted) for wanted in self.wanted_m]
         # for shares out of reach there is nothing to tell but for what was asked
-        self._kept_shares = [k for k, first in enumerate(self.first) if k == 0 or first.status == "ok"]
-        self._done: dict[int, list[Run]] = {k: [] for k in self._kept_shares}
+        self._shares = [k for k, first in enumerate(self.first) if k == 0 or first.status == "ok"]
+        self._done: dict[int, list[Run]] = {k: [] for k in self._shares}
         self._once: list[Run] = []
 
     @property
@@ -45,7 +45,7 @@ class Planned:
         """Do runs, and yield the share of them that is done."""
         fewer = [number for number in numbers if number % FEWER == 0]
         todo = [(-1, number) for number in numbers] + [(0, number) for number in numbers]
-        todo += [(k, number) for k in self._kept_shares[1:] for number in fewer]
+        todo += [(k, number) for k in self._shares[1:] for number in fewer]
         for count, (k, number) in enumerate(todo, 1):
             rng = np.random.default_rng([self._seed, 34, k + 1, number])
             ears, case = stated(self._ranging, rng), Case("planned", 0.0)
@@ -101,7 +101,7 @@ class Planned:
             )
             for k in range(len(run.robots))
         )
-        columns = ("leap", "robot", "way_m", "x_m", "y_m", "step_m", "width_m", "sd_m", "end_sd_m", "leaps_left")
+        columns = ("leap", "robot", "way_m", "x_m", "y_m", "step_m", "width_m", "sd_m", "end_sd_m", "left")
         wanted = self.wanted_m[0]
         if first.status == "ok":
             note = f"{_text(wanted)} wanted; foreseen at the start: {_text(first.end_sd_m)} after {first.leaps} leaps"
@@ -137,7 +137,7 @@ class Planned:
 
     def _by_share(self) -> list[int]:
         """Shares in rising order."""
-        return sorted(self._kept_shares, key=SHARES.__getitem__)
+        return sorted(self._shares, key=SHARES.__getitem__)
 
     def _apart(self, runs: Sequence[Run], case: str) -> Finding:
         """How many stops a run leave two robots where they cannot hear each other."""
