@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from draw.conftest import HALL, Run, hall_site, loop, make_run
 from sonofix.draw.team import LATEST_S, draw_team
-from sonofix.draw.team_times import spells
+from sonofix.draw.team_times import GAP_S, spells
 
 NAMES = ("K", "R1", "R2")
 
@@ -69,6 +70,24 @@ def test_a_long_recording_shows_its_last_minute_and_each_robot_alone(long_team: 
     boxes = [axes.get_position() for axes in figure.axes]
     for i, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[i + 1 :])
+
+
+def test_lines_break_where_a_robot_had_no_place(team: Run) -> None:
+    first, last = 5.0, 5.0 + GAP_S + 1.0
+    kept = [
+        replace(step, estimates=tuple(e for e in step.estimates if e.vehicle != "K" or not first < e.time_s < last))
+        for step in team.steps
+    ]
+    figure = draw_team(team.recording, kept, team.truths)
+    drawn = {line.get_label(): np.asarray(line.get_xdata()) for line in figure.axes[0].lines}
+    breaks = {name: np.flatnonzero(np.isnan(drawn[name])).tolist() for name in NAMES}
+    before = sum(e.vehicle == "K" and e.time_s <= first for step in kept for e in step.estimates)
+    assert breaks == {"K": [before], "R1": [], "R2": []}
+
+
+def test_one_row_is_drawn(team: Run) -> None:
+    """Nothing warns, which would be an error here."""
+    draw_team(team.recording, team.steps[:1], {}).savefig(BytesIO())
 
 
 def test_spells_are_what_a_robot_mostly_did() -> None:

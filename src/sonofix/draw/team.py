@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from sonofix.draw import style
-from sonofix.draw.team_times import draw_times
+from sonofix.draw.team_times import draw_times, parted
 from sonofix.records import Estimate, Floats, Recording, Step, Truth
 
 ELLIPSES = 14
@@ -181,7 +181,8 @@ def _draw_plan(
             true = truth.position_m[(truth.time_s >= track[0].time_s) & (truth.time_s <= track[-1].time_s)]
             plan.plot(true[:, 0], true[:, 1], color=style.TRUTH, linewidth=0.6, alpha=0.5, zorder=2)
         place = places(track)
-        plan.plot(*place.T, color=colours[name], linewidth=1.1, label=name, zorder=3)
+        way = parted(np.array([estimate.time_s for estimate in track]), place)
+        plan.plot(*way.T, color=colours[name], linewidth=1.1, label=name, zorder=3)
         for estimate in track[:: max(1, len(track) // ELLIPSES)] if not ends else track[-1:]:
             plan.add_patch(ellipse(estimate, colours[name]))
         if ends:

@@ -24,6 +24,9 @@ ROLES = {"explores": (0.62, 1.0), "base": (0.16, 1.0), "alone": (0.62, 0.22)}
 SPELLS = 150
 """Roles are told of so many spells, each by what it was mostly: shorter ones could not be seen."""
 
+GAP_S = 5.0
+"""Lines break where a robot had no place for longer."""
+
 _LEAST_SHARE = 0.02
 """Errors are drawn down to so small a share of the least deviation."""
 
@@ -60,6 +63,11 @@ def draw_times(
         axes.text(0.008, 0.93, name, transform=axes.transAxes, color=colours[name], fontsize=9, va="top", zorder=6)
 
 
+def parted(time_s: Floats, rows: Floats) -> Floats:
+    """Return rows (n, k) with one of NaN in each gap beyond `GAP_S`."""
+    return np.insert(rows, np.flatnonzero(np.diff(time_s) > GAP_S) + 1, np.nan, axis=0)
+
+
 def _sd_m(estimate: Estimate) -> float:
     return float(np.hypot(estimate.sd("x") or 0.0, estimate.sd("y") or 0.0))
 
@@ -80,7 +88,7 @@ def _draw_doubt(
         place = np.array([estimate.position_m[:2] for estimate in track])
         off = np.where(inside, np.hypot(*(place - true).T), np.nan)
         axes.plot(time, off, ".", color=colour, markersize=1.6, alpha=0.45, zorder=2)
-    axes.plot(time, sd_m, color=style.INK, linewidth=0.9, zorder=3)
+    axes.plot(*parted(time, np.column_stack([time, sd_m])).T, color=style.INK, linewidth=0.9, zorder=3)
     axes.set_yscale("log")
     axes.set_ylim(*limits)
     axes.yaxis.set_major_locator(LogLocator(numticks=4))
