@@ -151,7 +151,7 @@ def _draw_plans(
     for cell, (title, shown) in enumerate(cells):
         plan = figure.add_axes(_box(cell, columns, rows))
         _draw_plan(plan, recording, shown, truths, colours, limits, ends=cell == 0)
-        style.dress(plan, title, "" if cell else "all robots")
+        style.dress(plan, title)
         if cell:
             plan.set_title(title, loc="left", color=colours[title], fontsize=11.5, fontweight="bold", pad=7)
         if cell // columns == rows - 1:

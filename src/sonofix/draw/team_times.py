@@ -30,6 +30,9 @@ GAP_S = 5.0
 _LEAST_SHARE = 0.02
 """Errors are drawn down to so small a share of the least deviation."""
 
+_FEW = 6
+"""Lanes of more robots are too low for every decade's name."""
+
 _DOUBT = 0.57
 """Share of the height that deviations take; roles have the rest, but for the gap."""
 
@@ -58,6 +61,7 @@ def draw_times(
     for lane, (name, track) in enumerate(tracks.items()):
         axes = figure.add_axes((left, base + high * (len(tracks) - 1 - lane), width, 0.9 * high), sharex=roles)
         _draw_doubt(axes, track, sds[name], truths.get(name), colours[name], limits)
+        axes.yaxis.set_major_locator(LogLocator(numticks=4 if len(tracks) <= _FEW else 2))
         told = "line: stated; dots: error against the truth" if truths else ""
         style.dress(axes, "Deviation of position (m)" if lane == 0 else "", told if lane == 0 else "")
         axes.text(0.008, 0.93, name, transform=axes.transAxes, color=colours[name], fontsize=9, va="top", zorder=6)
@@ -91,7 +95,6 @@ def _draw_doubt(
     axes.plot(*parted(time, np.column_stack([time, sd_m])).T, color=style.INK, linewidth=0.9, zorder=3)
     axes.set_yscale("log")
     axes.set_ylim(*limits)
-    axes.yaxis.set_major_locator(LogLocator(numticks=4))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.tick_params(labelbottom=False)
