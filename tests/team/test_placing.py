@@ -1,6 +1,9 @@
 import numpy as np
 
+from sonofix.team.feed import gather
+from sonofix.team.fleet import follow
 from sonofix.team.placing import Clues, Shared, place
+from team.made_fleet import fleet, without_bearings
 
 ANCHORS = np.array([[0.0, 0.0, 0.3], [4.0, 1.0, 2.0]])
 SPREAD = np.diag([0.15, 0.15, 0.1]) ** 2
@@ -66,3 +69,19 @@ def test_robots_that_know_nothing_place_nobody():
     assert heard.shared is not None
     heard.shared.spread[:] *= 100.0
     assert place(heard, now, (1.0, 0.5)) is None
+
+
+def test_a_place_is_found_from_afar_where_ranges_alone_tell():
+    off = []
+    for seed, seconds in ((722, 14.0), (704, 60.0), (700, 14.0)):
+        recording, truth = fleet(seconds=seconds, seed=seed)
+        for moment, _ in follow(gather(without_bearings(recording))):
+            for event in moment.events:
+                rows = truth[event.vehicle]
+                robot = int(event.vehicle[1:])
+                true = [np.interp(moment.time_s, rows[:, 0], rows[:, i]) for i in (1, 2)]
+                off.append(np.hypot(*(moment.pose[robot, :2] - true)))
+            if moment.time_s > 10.0:
+                break
+    assert len(off) >= 9
+    assert max(off) < 0.5

@@ -28,6 +28,9 @@ BEARING_SD_RAD = 0.05
 LIMIT = 3.0
 """A residual of more deviations counts as this many: it is another thing that was heard."""
 
+BEGIN_LIMIT = 16.0
+"""So many times that the first step allows, half as many times each next."""
+
 RIVALS = 9.0
 """How much more another place must cost."""
 
@@ -102,6 +105,14 @@ class Clues:
     doubt: Floats | None = None
     """Where nothing is known of such, by how much odometry may have erred since, (m, 2) in m and rad: `place` tells."""
 
+    def keep(self, rows: NDArray[np.bool_]) -> Clues:
+        """Return some of them alone, of which no errors are shared."""
+        return Clues(
+            self.own[rows], self.other[rows], self.anchor[rows], self.listens[rows], self.arm[rows],
+            self.range_m[rows], self.bearing_rad[rows], self.compass[rows], self.pair[rows], None,
+            None if self.doubt is None else self.doubt[rows],
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
@@ -121,13 +132,13 @@ def place(clues: Clues, now: Floats, sd: tuple[float, float] = PLACED_SD) -> Pla
     if told < LEAST:
         return None
     best: list[tuple[float, Floats]] = []
-    clues = replace(clues, doubt=_doubt(clues, now))
+    clues = replace(clues, doubt=doubt_of(clues, now))
     for start in _starts(clues):
-        found = _settle(clues, start)
+        found = settle(clues, start)
         best.append((_cost(clues, found), found))
     best.sort(key=lambda pair: pair[0])
     cost, found = best[0]
-    missed = _residuals(clues, found)
+    missed = residuals(clues, found)
     residual, by, by_other = missed.residual, missed.by, missed.by_other
     kept = np.abs(residual) < LIMIT
     if np.count_nonzero(kept) < max(LEAST, AGREEING * len(residual)):
@@ -157,7 +168,7 @@ def place(clues: Clues, now: Floats, sd: tuple[float, float] = PLACED_SD) -> Pla
 
 def _cost(clues: Clues, frame: Floats) -> float:
     """Return the sum of squared misses; where errors may be shared, so much of those of one pair counts once."""
-    missed = _residuals(clues, frame)
+    missed = residuals(clues, frame)
     square, new = np.minimum(missed.residual**2, LIMIT**2), missed.new
     if clues.shared is None:
         return float(np.sum(square))
@@ -173,7 +184,7 @@ def _bounded(clues: Clues, shared: Shared, frame: Floats, kept: NDArray[np.bool_
     sum's covariance is no larger than that of each, 1/ω times as large, if Σ ω = 1 (covariance intersection); here ω
     goes with their deviations.
     """
-    missed = _residuals(clues, frame)
+    missed = residuals(clues, frame)
     m, turn = len(clues.range_m), _turn(frame)
     row = np.tile(np.arange(m), 2)[_told(clues)][kept]
     by_other, by_own, new = missed.by_other[kept], missed.by_own[kept] @ turn, missed.new[kept]
@@ -202,7 +213,8 @@ def _turn(frame: Floats) -> Floats:
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _doubt(clues: Clues, now: Floats) -> Floats:
+def doubt_of(clues: Clues, now: Floats) -> Floats:
+    """Return `Clues.doubt` of a robot that its odometry has at ``now`` (3,)."""
     way = np.hypot(*(clues.own[:, :2] - now[:2]).T)
     turned = np.abs(clues.own[:, 2] - now[2])
     return np.column_stack([WAY_SD * way + TURN_SD * turned * way / 2, TURN_SD * turned])
@@ -243,17 +255,20 @@ def _starts(clues: Clues) -> list[Floats]:
     return out
 
 
-def _settle(clues: Clues, frame: Floats) -> Floats:
-    for _ in range(STEPS):
-        missed = _residuals(clues, frame)
+def settle(clues: Clues, frame: Floats) -> Floats:
+    """Return the frame (3,) that robust Gauss–Newton steps lead to, from all that was heard to what agrees."""
+    for step in range(STEPS):
+        # graduated non-convexity (Yang et al., RA-L 5(2), 2020): from afar all would count as outliers
+        limit = LIMIT * max(1.0, BEGIN_LIMIT * 0.5**step)
+        missed = residuals(clues, frame)
         residual, by = missed.residual, missed.by
-        weight = 1.0 / (1.0 + (residual / LIMIT) ** 2) ** 2  # Geman and McClure 1987
+        weight = 1.0 / (1.0 + (residual / limit) ** 2) ** 2  # Geman and McClure 1987
         normal = by.T @ (weight[:, None] * by) + 1e-6 * np.eye(3)
-        step = -np.linalg.solve(normal, by.T @ (weight * residual))
-        step[:2] *= min(1.0, 2.0 / max(np.hypot(*step[:2]), 1e-9))
-        step[2] = np.clip(step[2], -0.5, 0.5)
-        frame = frame + step
-        if np.max(np.abs(step)) < 1e-6:
+        moved = -np.linalg.solve(normal, by.T @ (weight * residual))
+        moved[:2] *= min(1.0, 2.0 / max(np.hypot(*moved[:2]), 1e-9))
+        moved[2] = np.clip(moved[2], -0.5, 0.5)
+        frame = frame + moved
+        if limit == LIMIT and np.max(np.abs(moved)) < 1e-6:
             break
     return frame
 
@@ -279,7 +294,8 @@ class _Missed:
     new: Floats
 
 
-def _residuals(clues: Clues, frame: Floats) -> _Missed:
+def residuals(clues: Clues, frame: Floats) -> _Missed:
+    """Return by how much a frame (3,) misses clues: all ranges that were measured, then all bearings."""
     cos, sin = np.cos(frame[2]), np.sin(frame[2])
     ox, oy = clues.own[:, 0], clues.own[:, 1]
     yaw = frame[2] + clues.own[:, 2]
