@@ -8,7 +8,8 @@ from sonofix.records import Event, RangeEpoch, RangeRows, Recording, Step, Table
 from sonofix.site import Pair, Site
 from sonofix.team.apart import follow_apart
 from sonofix.team.feed import gather, heard_by
-from sonofix.team.fleet import follow, instants
+from sonofix.team.fleet import follow
+from sonofix.team.instants import instants
 from sonofix.team.message import BYTES, TOLD, Message, unpack
 from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from sonofix.records import Floats, Recording, Step
+    from sonofix.team.belief import Moment
     from sonofix.team.feed import Feed
-    from sonofix.team.fleet import Moment
     from sonofix.team.tell import Listened
 
 
@@ -84,7 +84,7 @@ def _run(
 
     from sonofix import files
     from sonofix.team.feed import heard_by
-    from sonofix.team.fleet import instants
+    from sonofix.team.instants import instants
     from sonofix.team.tell import steps_of
 
     recording = files.read_recording(folder, to_run="bearings" not in _stems(folder))

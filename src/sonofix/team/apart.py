@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Event, Floats
+from sonofix.team.belief import START_SD, Belief, Moment
 from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import ASK_S, START_SD, Belief, Moment, instants, leave
 from sonofix.team.hear import TOLD as HEARD
 from sonofix.team.hear import age
+from sonofix.team.instants import instants, leave
+from sonofix.team.joint import ASK_S
 from sonofix.team.kernel import expect, turned_by
 from sonofix.team.meeting import GAIN, Heard, Split, bends, judge, settle
 from sonofix.team.message import SENT, TOLD, Message, unpack

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from sonofix.records import Floats, RangeRows, Recording, Table
 from sonofix.site import Site
 from sonofix.track.wheels import STANDING_MPS, UNSEEN_RAD
 
-SIGHTING, COMPASS = range(2)
+SIGHTING, COMPASS, UNHEARD = range(3)
 
 BESIDE_M = 0.3
 """Fixed ends that stand nearer to one another are seen the same way: less than what stands in between is wide."""
@@ -36,7 +36,7 @@ class Feed:
     time_s : float64 (n,)
         When each row was heard, in order.
     kind : int64 (n,)
-        `SIGHTING` or `COMPASS` (``bearing_rad`` then is the listener's heading).
+        `SIGHTING`, `COMPASS` (``bearing_rad`` then is the listener's heading), or `UNHEARD`: not to be believed.
     listener, source : int64 (n,)
         Robots; −1: fixed in place.
     listener_point, source_point : float64 (n, 3)
@@ -110,6 +110,12 @@ class Feed:
             )
         }
         return replace(self, **cut, ends=tuple(e for e, kept in zip(self.ends, rows.tolist(), strict=True) if kept))
+
+    def without(self, starts: Collection[int], pairs: Collection[int]) -> Feed:
+        """Return the feed without the stated starts of some robots, and with what came of some pairs unheard."""
+        kind = np.where(np.isin(self.pair, list(pairs)), UNHEARD, self.kind)
+        left = {robot: start for robot, start in self.starts.items() if robot not in starts}
+        return replace(self, kind=kind, starts=left)
 
 
 def gather(recording: Recording, ranges: RangeRows | None = None, own_ranges: bool = False) -> Feed:

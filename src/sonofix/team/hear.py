@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sonofix.team.feed import COMPASS
+from sonofix.team.feed import COMPASS, SIGHTING, UNHEARD
 from sonofix.team.kernel import expect, turned_by
 from sonofix.team.noise import BEARING, CLIPPED, NEW, STAYING, fade, follow_run, take, variance_of
 from sonofix.team.state import SIZE, YAW
@@ -91,7 +91,7 @@ def hear(
         a, b = listener[i], source[i]
         used[k, 0] = used[k, 1] = False
         told[k, 0, 0] = told[k, 1, 0] = np.nan
-        if (a >= 0 and not placed[a]) or (b >= 0 and not placed[b]):
+        if kind[i] == UNHEARD or (a >= 0 and not placed[a]) or (b >= 0 and not placed[b]):
             continue
         if kind[i] == COMPASS:
             row[1, :] = 0.0
@@ -170,7 +170,7 @@ def learn(
     robots = len(known) - 2
     for i in range(rows[0], rows[1]):
         k = i - rows[0]
-        if kind[i] == COMPASS:
+        if kind[i] != SIGHTING:
             continue
         who = listener[i] if listener[i] >= 0 else robots
         for j in range(2):

@@ -82,6 +82,11 @@ class Noise:
     runs: Floats
     swell: Floats
 
+    def take_over(self, other: Noise) -> None:
+        """Go on by what another has learnt."""
+        for mine, its in ((self.known, other.known), (self.runs, other.runs), (self.swell, other.swell)):
+            mine[:] = its
+
 
 def noise(robots: int, views: int, believed: bool, stated_sd_m: float) -> Noise:
     """Return what is known before anything was heard; ``stated_sd_m``: of ranges, NaN where nobody vouches for them."""

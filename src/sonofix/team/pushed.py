@@ -22,7 +22,7 @@ from sonofix.team.state import POSE
 from sonofix.track.wheels import ROBUST
 
 if TYPE_CHECKING:
-    from sonofix.team.fleet import Belief
+    from sonofix.team.belief import Belief
     from sonofix.team.rough import Learnt
 
 SLIPPED = (3.0, 3.0, 0.5)

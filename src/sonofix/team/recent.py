@@ -9,19 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Floats
-from sonofix.team.feed import COMPASS, Feed
+from sonofix.team.feed import COMPASS, UNHEARD, Feed
 from sonofix.team.kernel import STRAYS, drive, strayed
 from sonofix.team.placing import Clues, Shared
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW
 
 if TYPE_CHECKING:
-    from sonofix.team.fleet import Belief
+    from sonofix.team.belief import Belief
 
 GATHER_S = 30.0
 """Clues are gathered for so long."""
 
 APART_S = 2.0
 """Clues of one pair that are closer tell the same."""
+
+
+def lasting(span_s: float) -> float:
+    """Return which share of its variance the mean of a slip has over so long (Gauss-Markov)."""
+    span_s = max(span_s, 1e-9)
+    return 2.0 * SLIP_S / span_s * (1.0 - SLIP_S / span_s * -np.expm1(-span_s / SLIP_S))
 
 
 class Recent:
@@ -58,7 +64,7 @@ class Recent:
                     continue
                 self._heard_s[robot] = time_s
                 key = (int(feed.pair[i]), robot)
-                known = other < 0 or sure[other]
+                known = feed.kind[i] != UNHEARD and (other < 0 or sure[other])
                 if placed[robot] or not known or time_s - self._last_s.get(key, -np.inf) < APART_S:
                     continue
                 self._last_s[key] = time_s
@@ -73,6 +79,10 @@ class Recent:
                 while time_s - feed.time_s[self._kept[robot][0][0]] > GATHER_S:
                     self._kept[robot].popleft()
         return told
+
+    def believe(self, feed: Feed) -> None:
+        """Go on by another part of the same recording."""
+        self._feed = feed
 
     def forget(self, robot: int) -> None:
         """Forget all of a robot: its odometry does not join what was heard to what will be."""
@@ -95,6 +105,7 @@ class Recent:
             row
             for row in self._kept[robot]
             if now_s - feed.time_s[row[0]] <= GATHER_S
+            and feed.kind[row[0]] != UNHEARD
             and (self._other(robot, row[0]) < 0 or placed[self._other(robot, row[0])])
         ]
         if not kept:
@@ -159,9 +170,7 @@ class Recent:
             strayed(by, strays, noise)
             poses[k] = now - pose
             poses[k, YAW] = own[YAW]
-            span_s = max(now_s - time_s, 1e-9)
-            lasting = 2.0 * SLIP_S / span_s * (1.0 - SLIP_S / span_s * -np.expm1(-span_s / SLIP_S))
-            by[:, [SPEED_SLIP, TURN_SLIP]] *= np.sqrt(lasting)
+            by[:, [SPEED_SLIP, TURN_SLIP]] *= np.sqrt(lasting(now_s - time_s))
             back = np.linalg.inv(by[:, :POSE])
             astray[k] = back @ by[:, POSE:] @ root
             left.append(back @ noise @ back.T)

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from sonofix.records import Floats
-from sonofix.team.feed import COMPASS, Feed
+from sonofix.team.feed import SIGHTING, Feed
 from sonofix.team.kernel import advance, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
 from sonofix.team.state import SIZE, SLIP_S, SLIP_SD, SPEED_SLIP, TURN_SLIP, wander_psd
@@ -25,7 +25,7 @@ from sonofix.track.kernel import absorb
 from sonofix.track.stated import HEAVY
 
 if TYPE_CHECKING:
-    from sonofix.team.fleet import Belief
+    from sonofix.team.belief import Belief
 
 DECADES = (-2, -1, 0, 1, 2)
 """Powers of ten by which members multiply the variances of place, and of heading."""
@@ -56,7 +56,7 @@ def weigh(
     work, fast = np.empty((3, SIZE)), np.zeros(2)
     for i in range(rows[0], rows[1]):
         a, b = listener[i], source[i]
-        if kind[i] == COMPASS or (a != robot and b != robot):
+        if kind[i] != SIGHTING or (a != robot and b != robot):
             continue
         other = b if a == robot else a
         if other >= 0 and not placed[other]:

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonofix.records import Floats
-from sonofix.team.feed import COMPASS, Feed
-from sonofix.team.fleet import START_SD, Belief, Moment
+from sonofix.team.belief import START_SD, Belief, Moment
+from sonofix.team.feed import COMPASS, SIGHTING, UNHEARD, Feed
 from sonofix.team.hear import REFUSED, age, spread
 from sonofix.team.kernel import STRAYS, advance, drive, expect, turned_by
 from sonofix.team.noise import BEARING, NEW, STAYING, Noise, fade, variance_of
 from sonofix.team.pushed import SLIPPED, Push
+from sonofix.team.recent import GATHER_S
 from sonofix.team.state import POSE, SIZE, SLIP_S, SPEED_SLIP, TURN_SLIP, YAW, prior, wander_psd
 from sonofix.track.kernel import absorb
 from sonofix.track.wheels import COMPASS_SD_RAD, ROBUST
@@ -71,6 +72,9 @@ def smooth(
         raise ValueError(
             f"{count} moments of {n} states take {needed / 1e9:.1f} GB to smooth; cut the recording in parts"
         )
+    # what was found wrong on the way is so from the beginning
+    wrong = {pair for moment in moments for pair in moment.unheard}
+    feed = feed.without({robot for moment in moments for robot in moment.gainsaid}, wrong)
     active, opened = _spans(feed, moments)
     nominal = _whole(feed, moments, means, active)
     errors = _errors(feed, belief.noise)
@@ -100,7 +104,7 @@ def smooth(
 def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Floats]:
     """Return which robots take part at each moment (k, V), and by what variances (k, V, POSE) their poses open then."""
     robots = len(feed.robots)
-    placed = np.array([moment.placed for moment in moments])
+    placed = _placed(moments)
     active, opened = placed.copy(), np.zeros((len(moments), robots, POSE))
     times = np.array([moment.time_s for moment in moments])
     for r in range(robots):
@@ -111,7 +115,7 @@ def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Fl
             continue
         begin = min(int(np.searchsorted(times, told[0])), int(at[0]))
         active[begin : at[0], r] = True
-        opened[begin, r] = np.square(START_SD if r in feed.starts and begin == at[0] == 0 else OPEN_SD)
+        opened[begin, r] = np.square(START_SD if r in feed.starts and begin == 0 else OPEN_SD)
         again = at[1:][np.diff(at) > 1]
         opened[again, r] = np.square(OPEN_SD)
     for moment in moments:
@@ -121,6 +125,18 @@ def _spans(feed: Feed, moments: Sequence[Moment]) -> tuple[NDArray[np.bool_], Fl
             share = np.diff(np.append(push.after_s, times[within])) / (push.until_s - push.after_s)
             opened[within, push.robot] += share[:, None] * np.square(SLIPPED)
     return active, opened
+
+
+def _placed(moments: Sequence[Moment]) -> NDArray[np.bool_]:
+    """Return which robots have a place at each moment (k, V), but for what was believed until all began anew.
+
+    Later than clues are gathered for, that is nearer to where they were than odometry run backwards.
+    """
+    placed = np.array([moment.placed for moment in moments])
+    for k, moment in enumerate(moments):
+        if moment.anew and moment.time_s - moments[0].time_s <= GATHER_S:
+            placed[:k, placed[k:].any(axis=0)] = False
+    return placed
 
 
 def _contradicted(moments: Sequence[Moment], robots: int) -> Floats:
@@ -147,10 +163,9 @@ def _whole(feed: Feed, moments: Sequence[Moment], means: Floats, active: NDArray
     """
     nominal = means.copy()
     times = np.array([moment.time_s for moment in moments])
-    for r in range(len(feed.robots)):
-        placed = [k for k, moment in enumerate(moments) if moment.placed[r]]
-        if placed:
-            _backwards(feed, nominal, times, active, r, placed[0], 0)
+    for r, placed in enumerate(_placed(moments).T):
+        if placed.any():
+            _backwards(feed, nominal, times, active, r, int(np.argmax(placed)), 0)
     for k, moment in enumerate(moments):
         for push in moment.pushes:
             within = _within(push, times)
@@ -197,6 +212,7 @@ def _errors(feed: Feed, noise: Noise) -> Floats:
     for i in range(len(feed.time_s)):
         if feed.kind[i] == COMPASS:
             out[i, 1] = COMPASS_SD_RAD**2
+        if feed.kind[i] != SIGHTING:
             continue
         view, who, range_m = feed.view[i], int(feed.listener[i]), float(feed.range_m[i])
         listener = who if who >= 0 else len(feed.robots)
@@ -253,7 +269,11 @@ def _pass(
             if opened[k, r].any():
                 at = np.arange(SIZE * r, SIZE * r + POSE)
                 if k == 0 or not active[k - 1, r]:
-                    mean[at] = feed.starts[r] if k == 0 and r in feed.starts else nominal[k, at]
+                    mean[at] = nominal[k, at]
+                    if k == 0 and r in feed.starts:
+                        mean[at] = feed.starts[r]
+                        # a way run backwards may have turned round more often
+                        mean[at[YAW]] = nominal[k, at[YAW]] + turned_by(feed.starts[r][YAW] - nominal[k, at[YAW]])
                     covariance[at, :] = covariance[:, at] = 0.0
                     bys[k, r][:] = 0.0
                 covariance[at, at] += opened[k, r]
@@ -291,7 +311,7 @@ def _hear(
             age(mean, covariance, first + view[i], errors[i, LEFT])
     for i in range(rows[0], rows[1]):
         a, b = listener[i], source[i]
-        if (a >= 0 and not active[a]) or (b >= 0 and not active[b]):
+        if kind[i] == UNHEARD or (a >= 0 and not active[a]) or (b >= 0 and not active[b]):
             continue
         shown = direction = 0.0
         if kind[i] == COMPASS:
@@ -419,7 +439,8 @@ def _judge(feed: Feed, moments: Sequence[Moment], nominal: Floats, active: NDArr
     for k, moment in enumerate(moments):
         for i in range(*moment.rows):
             a, b = int(feed.listener[i]), int(feed.source[i])
-            if (a >= 0 and not active[k, a]) or (b >= 0 and not active[k, b]):
+            unheard = feed.kind[i] == UNHEARD
+            if unheard or (a >= 0 and not active[k, a]) or (b >= 0 and not active[k, b]):
                 continue
             if feed.kind[i] == COMPASS:
                 left = np.array([np.nan, turned_by(feed.bearing_rad[i] - nominal[k, SIZE * a + YAW])])

@@ -11,8 +11,9 @@ import numpy as np
 from sonofix.acquire import tones
 from sonofix.ranging import RANGES_WITHOUT_SD_M, with_sound_speed
 from sonofix.records import Estimate, Event, Floats, RangeEpoch, RangeRows, Source, Step
+from sonofix.team.belief import Moment
 from sonofix.team.feed import Feed
-from sonofix.team.fleet import Moment, instants
+from sonofix.team.instants import instants
 
 CHANGED_DB = 3.0
 """By so much a tone's level must change to be told of again."""

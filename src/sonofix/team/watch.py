@@ -103,6 +103,11 @@ class Watch:
                 found.append((-share, robot, self._first.setdefault(robot, min(refused.values()))))
         return [(robot, first) for _, robot, first in sorted(found)]
 
+    def disagrees(self, robot: int) -> bool:
+        """Whether most of what was heard of a robot latest does not agree with where it is."""
+        latest = self._latest[robot]
+        return sum(not agrees for _, _, agrees, _ in latest) >= ASTRAY * max(len(latest), 4)
+
     def refused(self, robot: int) -> bool:
         """Whether most of what was heard of a robot latest was not even believed."""
         latest = self._latest[robot]
