@@ -46,6 +46,7 @@ def followed(recording: Recording):
     for moment, belief in follow(feed):
         moments.append(moment)
         means.append(belief.mean.copy())
+    assert belief is not None
     return moments, np.array(means), belief, feed
 
 

@@ -38,18 +38,28 @@ def follow(feed: Feed, until_placed: bool = False) -> Iterator[tuple[Moment, Bel
         return
     steps = instants(feed)
     told, landmarks = _Told(feed), Landmarks(feed)
+    wrong: set[int] = set()
+    gainsaid: set[int] = set()
     for k, (time_s, first, last) in enumerate(steps):
         moment = told.step(time_s, (first, last))
+        wrong |= set(moment.unheard)
+        gainsaid |= set(moment.gainsaid)
         pairs, events = landmarks.judge(told.sure, time_s, (first, last))
         if pairs:
-            feed = feed.without((), pairs)
+            wrong |= pairs
             since = next(i for i, step in enumerate(steps) if time_s - step[0] <= GATHER_S)
             before = moment
-            moment, told = _again(feed if since == 0 else feed.without(feed.starts, ()), steps[since : k + 1], before)
-            events = [*before.events, *events, *moment.events]
-            gainsaid = (*before.gainsaid, *moment.gainsaid)
-            unheard = (*before.unheard, *moment.unheard, *pairs)
-            moment = replace(moment, events=tuple(events), gainsaid=gainsaid, unheard=unheard, anew=True)
+            left = feed.without(gainsaid if since == 0 else feed.starts, wrong)
+            moment, told = _again(left, steps[since : k + 1], before)
+            wrong |= set(moment.unheard)
+            gainsaid |= set(moment.gainsaid)
+            moment = replace(
+                moment,
+                events=(*before.events, *events, *moment.events),
+                gainsaid=(*before.gainsaid, *moment.gainsaid),
+                unheard=(*before.unheard, *moment.unheard, *pairs),
+                anew=True,
+            )
         yield moment, told.team.belief
 
 
