@@ -66,18 +66,21 @@ def test_derivatives_of_driving_are_finite_differences(own):
 
 
 @settings(max_examples=40, deadline=None)
-@given(states, states, st.sampled_from([(0, 1), (0, -1), (-1, 1)]), st.booleans())
-def test_derivatives_of_what_is_heard_are_finite_differences(first, second, ends, common):
+@given(states, states, st.sampled_from([(0, 1), (0, -1), (-1, 1)]), st.booleans(), st.sampled_from([0.0, 1.0]))
+def test_derivatives_of_what_is_heard_are_finite_differences(first, second, ends, common, told_mps):
     about = np.concatenate([first, second + np.array([5, 5] + [0] * (SIZE - 2))])
     arms = np.array([0.2, 0.1, 0.3]), np.array([-0.1, 0.3, 1.0])
-    speed, rows, scratch = np.zeros(2), np.empty((2, 2 * SIZE)), np.empty((2, 2 * SIZE))
-    expect(about, *ends, *arms, 1 / 343, speed, common, rows)
+    rows, scratch = np.empty((2, 2 * SIZE)), np.empty((2, 2 * SIZE))
+
+    def shown(state, into):
+        # a source that drives was elsewhere when it sent
+        rest = 1 - state.reshape(2, SIZE)[:, SPEED] - state.reshape(2, SIZE)[:, SPEED_SLIP]
+        return expect(state, *ends, *arms, 1 / 343, told_mps * rest, common, into)
+
+    shown(about, rows)
     for j in range(2 * SIZE):
         h = 1e-6
-        told = [
-            expect(about + sign * h * np.eye(2 * SIZE)[j], *ends, *arms, 1 / 343, speed, common, scratch)
-            for sign in (1, -1)
-        ]
+        told = [shown(about + sign * h * np.eye(2 * SIZE)[j], scratch) for sign in (1, -1)]
         difference = (np.array(told[0][:2]) - told[1][:2]) / (2 * h)
         if abs(difference[1]) > 1e3:  # the direction jumps by a turn here
             continue

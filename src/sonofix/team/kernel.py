@@ -272,10 +272,15 @@ def expect(about, listener, source, listener_point, source_point, flight_s_per_m
     end_of(about, listener, listener_point, here, here_by)
     end_of(about, source, source_point, there, there_by)
     dx, dy, dz = there[0] - here[0], there[1] - here[1], source_point[2] - listener_point[2]
+    way, cos, sin = 0.0, 1.0, 0.0
     if source >= 0:
         way = np.sqrt(dx * dx + dy * dy + dz * dz) * flight_s_per_m * speed[source]
-        dx -= way * np.cos(about[SIZE * source + YAW])
-        dy -= way * np.sin(about[SIZE * source + YAW])
+        cos, sin = np.cos(about[SIZE * source + YAW]), np.sin(about[SIZE * source + YAW])
+        dx -= way * cos
+        dy -= way * sin
+        # where it was when it sent turns with its heading
+        there_by[0] += way * sin
+        there_by[1] -= way * cos
     flat = max(dx * dx + dy * dy, 1e-12)
     r = np.sqrt(flat + dz * dz)
     rows[:, :] = 0.0
@@ -301,6 +306,10 @@ def expect(about, listener, source, listener_point, source_point, flight_s_per_m
         at = SIZE * source
         rows[0, at + X], rows[0, at + Y] = scale * dx / r, scale * dy / r
         rows[0, at + YAW] = scale * (dx * there_by[0] + dy * there_by[1]) / r
+        rest = 1.0 - about[at + SPEED] - about[at + SPEED_SLIP]
+        if rest != 0.0:
+            rows[0, at + SPEED] = rows[0, at + SPEED_SLIP] = scale * way * (dx * cos + dy * sin) / (r * rest)
+            rows[1, at + SPEED] = rows[1, at + SPEED_SLIP] = way * (dx * sin - dy * cos) / (flat * rest)
         rows[1, at + X], rows[1, at + Y] = -dy / flat, dx / flat
         rows[1, at + YAW] = (-dy * there_by[0] + dx * there_by[1]) / flat
     return shown, direction, r
