@@ -30,7 +30,7 @@ CORNERS = {
     "B4": (0.0, 6.0, 2.7),
     "B5": (4.0, 3.0, 3.3),
 }
-OUTPUTS = {"ranges.csv", "fixes.csv", "track.csv", "events.csv", "track.tum"}
+OUTPUTS = {"ranges.csv", "fixes.csv", "track.csv", "events.csv", "innovations.csv", "track.tum"}
 
 
 def hall() -> dict:

@@ -572,3 +572,14 @@ def test_ranges_that_state_too_much_of_themselves_are_found_out():
         ratios.append([nees(*errors([m for m, _ in one], truth, after_s=20)) for one in found])
     # 2 where deviations are right; by 4 stated deviations off, ranges are believed by far less than they ask for
     assert np.mean(ratios, axis=0)[0] < 8.0 < 30.0 < np.mean(ratios, axis=0)[1]
+
+
+def test_innovations_of_the_stated_noise_are_no_larger_than_expected():
+    rows, squares = 0, 0.0
+    for seed in range(3):
+        for moment, _ in follow(gather(fleet(seconds=40.0, seed=seed)[0])):
+            if moment.innovation is not None and moment.time_s > 20.0:
+                rows, squares = rows + moment.innovation.rows, squares + moment.innovation.nis
+    # noise begins as twice what it is, is still being learnt, and swells where a few innovations look alike by chance
+    assert rows > 3000
+    assert 0.5 < squares / rows < 1.05

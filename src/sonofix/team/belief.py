@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.records import Event, Floats
+from sonofix.records import Event, Floats, Innovation
 from sonofix.team.feed import Feed
 from sonofix.team.hear import TOLD, hear, learn
 from sonofix.team.kernel import advance
@@ -63,6 +63,7 @@ class Moment:
     events: tuple[Event, ...] = ()
     pushes: tuple[Push, ...] = ()
     odds: tuple[Odds, ...] = ()
+    innovation: Innovation | None = None
     gainsaid: tuple[int, ...] = ()
     unheard: tuple[int, ...] = ()
     anew: bool = False

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sonofix.records import Event
+from sonofix.records import Event, Floats, Innovation
 from sonofix.team.belief import START_SD, Belief, Moment
 from sonofix.team.feed import SIGHTING, Feed
 from sonofix.team.hear import TOLD
@@ -100,7 +101,8 @@ class Team:
         odds = self.watch.at_odds() if not unproven else ()
         events += [event for one in odds if one.robots not in self._told_of for event in _odd(feed, one, time_s)]
         self._told_of = {one.robots for one in odds}
-        moment = replace(belief.moment(time_s, rows, used, events, pushes), odds=odds)
+        moment = belief.moment(time_s, rows, used, events, pushes)
+        moment = replace(moment, odds=odds, innovation=_innovation(time_s, used, told))
         for one in odds:
             moment.covariance[list(one.robots), :2, :2] += one.variance_m2 * np.eye(2)
         for robot, _ in self.watch.astray():
@@ -166,6 +168,12 @@ class Team:
             self._rough.unlearn(belief, one, was.learnt, was.rough)
         self.watch.clear(robot)
         return True
+
+
+def _innovation(time_s: float, used: NDArray[np.bool_], told: Floats) -> Innovation | None:
+    """Sum what `hear.hear` told of ranges and bearings; a compass is no part of it."""
+    square = told[..., 6][used & np.isfinite(told[..., 6])]
+    return Innovation(time_s, len(square), float(square.sum())) if len(square) else None
 
 
 def placed_text(pose: np.ndarray) -> str:

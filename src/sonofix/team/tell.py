@@ -148,7 +148,9 @@ def steps_of(
             source: Source = "smoothed" if smoothed else "fused" if robot in entered else "predicted"
             estimates.append(_estimate(feed, moment, robot, source))
         used = moment.used[[i - first for i in heard], 0]
-        yield Step(epoch, (), tuple(estimates), (*before, *moment.events), used, np.zeros(len(heard)))
+        told = (moment.innovation,) if moment.innovation is not None else ()
+        all_events = (*before, *moment.events)
+        yield Step(epoch, (), tuple(estimates), all_events, used, np.zeros(len(heard)), innovations=told)
 
 
 def _shown(
