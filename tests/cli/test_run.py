@@ -80,7 +80,14 @@ def test_ranges_in_everything_out(tmp_path):
     error = [np.hypot(float(r["x_m"]) - 4 - 2 * np.cos(float(r["time_s"]) / 5),
                       float(r["y_m"]) - 3 - 2 * np.sin(float(r["time_s"]) / 5)) for r in track]  # fmt: skip
     assert np.sqrt(np.mean(np.square(error))) < 0.02
-    for words in ("small hall: 40 epochs", "200 of 200 ranges used", "40 / 40", "position error, rms", "HDOP, median"):
+    for words in (
+        "small hall: 40 epochs",
+        "200 of 200 ranges used",
+        "40 / 40",
+        "position error, rms",
+        "HDOP, median",
+        "NIS per",
+    ):
         assert words in told.stdout
     assert f"Written to {out}" in told.stdout
 

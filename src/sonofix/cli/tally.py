@@ -29,6 +29,7 @@ class Tally:
         self._last_s = -np.inf
         self._events: Counter[str] = Counter()
         self._remarks: Counter[str] = Counter()
+        self._nis_rows, self._nis = array("d"), array("d")
 
     def add(self, step: Step) -> None:
         """Count one step."""
@@ -38,6 +39,9 @@ class Tally:
         self._first_s = step.ranges.sync_s if self._first_s is None else self._first_s
         self._last_s = max(self._last_s, step.ranges.sync_s, *step.ranges.time_s.tolist())
         self._events.update(event.event for event in step.events)
+        for one in step.innovations:
+            self._nis_rows.append(one.rows)
+            self._nis.append(one.nis)
         for tally in self._of.values():
             tally.add(step)
         self._remarks.update(fix.remedy for fix in step.fixes if fix.status != "ok" and fix.remedy)
@@ -62,8 +66,16 @@ class Tally:
         }
 
     def remarks(self) -> list[str]:
-        """Return lines on events and on epochs without a fix."""
+        """Return lines on innovations, on events and on epochs without a fix."""
+        from sonofix.score import score_innovations
+
         lines = []
+        found = score_innovations(np.array(self._nis_rows), np.array(self._nis))
+        if found is not None:
+            above = f"{100 * found.above:.1f} % of corrections above their 95 % band"
+            lines.append(
+                f"NIS per measurement: {found.nis_per_row:.2f} (beyond 1 errors are stated too small), {above}"
+            )
         if self._events:
             named = ", ".join(f"{count} {name}" for name, count in self._events.most_common())
             lines.append(f"Events: {named} (events.csv)")
