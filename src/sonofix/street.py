@@ -76,9 +76,10 @@ class Street:
         if self._late_s > 0.0:
             self._rewinder = self._rewinder or Rewinder(self.follower, self._late_s)
             estimates, used, events = self._rewinder.step(epoch, fixes)
-            self.follower = self._rewinder.follower
+            self.follower, entered = self._rewinder.follower, self._rewinder.innovation
         else:
             estimates, used, events = self.follower.step(epoch, fixes)
+            entered = self.follower.innovation
         believed = used.copy()
         offset = np.full(len(epoch), 0.0 if epoch.clock == "known" else np.nan)
         if epoch.clock == "common" and estimates and estimates[0].clock_offset_m is not None:
@@ -93,8 +94,7 @@ class Street:
             believed[:] = False
         if self.rate_hz is not None:
             estimates = self._between(before, hidden, estimates)
-        entered = self.follower.innovation
-        innovations = (entered,) if entered is not None and not any(event.event == "late" for event in events) else ()
+        innovations = () if entered is None else (entered,)
         told = flags + told + events
         return Step(epoch, fixes, estimates, told, believed & np.isfinite(offset), offset, innovations=innovations)
 

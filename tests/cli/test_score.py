@@ -128,3 +128,11 @@ def test_roll_and_pitch_are_judged_where_truth_and_track_have_them(folder):
     table = runner.invoke(app, ["score", str(folder)]).stdout
     for words in ("roll error, rms", "pitch error, rms", "1.72 °", "0.57 °", "3 is right"):
         assert words in table
+
+
+def test_innovations_that_cannot_be_are_named(folder):
+    (folder / "out" / "innovations.csv").write_text("time_s,rows,nis\n1.0,2.5,3.0\n1.5,2,-4\n")
+    told = runner.invoke(app, ["score", str(folder)])
+    assert told.exit_code != 0
+    for words in ("innovations.csv", "line 2, rows", "2.5", "line 3, nis", "-4"):
+        assert words in told.stderr

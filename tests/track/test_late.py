@@ -59,6 +59,15 @@ def test_estimates_are_always_of_the_latest_instant() -> None:
     assert all(step.range_used.any() for step in steps)
 
 
+def test_innovations_are_of_the_epoch_that_came() -> None:
+    site, order = make_site(HALL, level_m=1.1), [0, 1, 3, 2, 4, 6, 5]
+    _, steps = walked(site, order, 1.0, False)
+    _, right = walked(site, list(range(7)), 0.0, False)
+    for k, step in zip(order, steps, strict=True):
+        if k in (2, 4, 5):  # what came before it is the same by then
+            assert step.innovations == right[k].innovations
+
+
 def test_what_comes_too_late_is_left_out_and_told() -> None:
     site = make_site(HALL, level_m=1.1)
     street, steps = walked(site, [0, 1, 2, 4, 5, 6, 3], 1.0, False)
@@ -67,6 +76,7 @@ def test_what_comes_too_late_is_left_out_and_told() -> None:
     assert event.event == "late"
     assert "1.5 s late" in event.detail
     assert not steps[-1].range_used.any()
+    assert not steps[-1].innovations
     assert not steps[-1].estimates
     np.testing.assert_array_equal(street.follower.belief.mean, without.follower.belief.mean)
 

@@ -60,7 +60,16 @@ def read_fixes(path: Path) -> Table | None:
 
 def read_innovations(path: Path) -> Table | None:
     """Read the innovations of a run; None where there is no such file. Errors as `read_fixes`."""
-    return _read(path, _NEEDED["innovations.csv"]) if path.exists() else None
+    if not path.exists():
+        return None
+    table, sheet = _read(path, _NEEDED["innovations.csv"]), Sheet(str(path))
+    for line, (rows, nis) in enumerate(zip(table.columns["rows"], table.columns["nis"], strict=True), 2):
+        if not (rows >= 1 and rows % 1 == 0):
+            sheet.tell(f"line {line}, rows", f"{rows:g}", "must be a whole number from 1 on")
+        if not nis >= 0:
+            sheet.tell(f"line {line}, nis", f"{nis:g}", "must be 0 or more")
+    sheet.check()
+    return table
 
 
 def by_vehicle(table: Table) -> Iterator[tuple[str, Table]]:

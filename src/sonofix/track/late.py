@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sonofix.records import Estimate, Event, Fix, RangeEpoch
+from sonofix.records import Estimate, Event, Fix, Innovation, RangeEpoch
 from sonofix.track.follow import Follower
 
 
@@ -35,12 +35,18 @@ class Rewinder:
         As it is before the first epoch.
     window_s : float
         By how much an epoch may come late, counted from the latest; what comes later still is left out, and told.
+
+    Attributes
+    ----------
+    innovation : Innovation or None
+        Of the epoch that came last, at its own instant.
     """
 
     def __init__(self, follower: Follower, window_s: float) -> None:
         self.follower = follower
         self._window_s = window_s
         self._taken: list[_Taken] = []
+        self.innovation: Innovation | None = None
 
     def step(
         self, epoch: RangeEpoch, fixes: tuple[Fix, ...]
@@ -52,6 +58,7 @@ class Rewinder:
         time_s = self.follower.time_of(epoch)
         times = [taken.time_s for taken in self._taken]
         if times and time_s < times[-1] - self._window_s:
+            self.innovation = None
             late_s = times[-1] - time_s
             text = f"came {late_s:.3g} s late, beyond the window of {self._window_s:g} s: left out"
             return (), np.zeros(len(epoch), bool), (Event(time_s, "", "late", text),)
@@ -61,6 +68,7 @@ class Rewinder:
             self.follower = since[0].before
         del self._taken[at:]
         estimates, used, events = self._follow(_Taken(time_s, epoch, fixes, self.follower))
+        self.innovation = self.follower.innovation
         for taken in since:
             estimates, _, _ = self._follow(taken)
         last_s = self._taken[-1].time_s

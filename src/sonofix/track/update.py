@@ -283,13 +283,13 @@ def noise_of(
     """Covariance (m, m) of rows as `row_noise` gives it, less what stays with a pair and is followed as a state.
 
     ``derivative`` (m, n) is what `expect` told of them. Rows of our own share one acceleration of each vehicle, which
-    each sees from its side and for as long as it was heard from the instant of the state. Ranges of others are weighed
-    one by one, and take it as noise of their own.
+    each sees from its side and for as long as it was heard, or sent, from the instant of the state. Ranges of others
+    are weighed one by one, and take it as noise of their own.
     """
     others = belief.trust is not None and epoch.snr_db is None
     noise = row_noise(epoch, links, rows, dt, agile_mps2=MANOEUVRE_MPS2 if others else 0.0)
     if not others:
-        seen = _accelerated(belief, derivative, dt)
+        seen = _accelerated(belief, derivative, len(rows))
         noise += seen @ seen.T
     if len(pair):
         at = np.arange(len(rows))
@@ -297,20 +297,25 @@ def noise_of(
     return noise
 
 
-def _accelerated(belief: Belief, derivative: Floats, dt: Floats) -> Floats:
+def _accelerated(belief: Belief, derivative: Floats, count: int) -> Floats:
     """Return what each row (m, k) changes by as a vehicle's place or angle is accelerated, by one deviation each.
 
-    At dt an acceleration a has changed the velocity by a dt and the place by a dt² / 2; the derivative by the velocity
-    holds that of the place dt times already.
+    A row speaks of a vehicle at w, when it was heard, or sent where the vehicle carries the emitter. By then an
+    acceleration a has changed the velocity by a w and the place by a w² / 2; the derivative by the velocity holds w
+    times that by the place. ``count``: ranges, the first of the rows.
     """
-    places = (0, 1, 2, YAW, ROLL, PITCH)
-    at = np.array([SIZE * v + p for v in np.flatnonzero(belief.placed).tolist() for p in places], np.int64)
-    at = at[belief.free[at]]
-    part = at % SIZE
-    rate = at + np.where(part < ROLL, 4, 2)
-    sd = np.where(part < YAW, MANOEUVRE_MPS2, MANOEUVRE_RADPS2)
-    late = np.tile(dt, len(derivative) // len(dt))[:, None]
-    return sd * late * (derivative[:, rate] - derivative[:, at] * late / 2)
+    seen = []
+    for vehicle in np.flatnonzero(belief.placed).tolist():
+        places = SIZE * vehicle + np.array([0, 1, 2, YAW, ROLL, PITCH])
+        by_place, by_velocity = derivative[:count, places[:3]], derivative[:count, places[:3] + 4]
+        square = np.sum(by_place**2, axis=1)
+        when = np.where(square > 0.0, np.sum(by_place * by_velocity, axis=1) / np.where(square > 0.0, square, 1.0), 0.0)
+        when = np.tile(when, len(derivative) // count)[:, None]
+        at = places[belief.free[places]]
+        rate = at + np.where(at % SIZE < ROLL, 4, 2)
+        sd = np.where(at % SIZE < YAW, MANOEUVRE_MPS2, MANOEUVRE_RADPS2)
+        seen.append(sd * when * (derivative[:, rate] - derivative[:, at] * when / 2))
+    return np.hstack([np.zeros((len(derivative), 0)), *seen])
 
 
 def _learn(
