@@ -171,3 +171,34 @@ def test_outliers_are_no_slip_and_a_push_is(pushed: bool, rng: np.random.Generat
     assert len(slips) == pushed
     assert all(20.0 < at_s < 21.0 for at_s in slips)
     assert max(miss) < 0.5
+
+
+def test_a_pushed_vehicle_that_no_fix_ever_places_keeps_its_start(rng: np.random.Generator) -> None:
+    # two beacons leave its mirror image open: without its start it would have no place at all
+    times = np.arange(0.0, 10.0, 0.1)
+    table = Table({"time_s": times, "v_mps": 0.5 + 0 * times, "yaw_rate_radps": 0 * times})
+    start = Table({"x_m": np.array([1.0]), "y_m": np.array([3.0]), "yaw_rad": np.array([0.0])})
+
+    def street() -> Street:
+        made = Street(WALL_SITE, start)
+        made.sense({"odometry": table})
+        return made
+
+    def begin() -> Follower:
+        made = street()
+        made.begin(0.05)
+        return made.follower
+
+    causal, heard, events = street(), [], []
+    for k in range(19):
+        at_s = 0.05 + 0.5 * k
+        place = (1.0 + 0.5 * at_s, 3.0 if k < 10 else 4.0, 0.0)
+        step = causal.walk(make_epoch(WALL_SITE, Drive(place), at_s, sd_m=0.005, rng=rng))
+        heard.append((step.ranges, step.fixes))
+        events += [event.event for event in step.events]
+        assert not any(found.status == "ok" for found in step.fixes)
+    assert events.count("slip") == 1
+    track = smooth(begin, heard)
+    assert [len(some) for some in track] == [1] * len(heard)
+    assert abs(track[-1][0].position_m[1] - 4.0) < 0.05
+    assert abs(track[0][0].position_m[1] - 3.0) < 0.05

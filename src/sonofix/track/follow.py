@@ -71,8 +71,6 @@ class Follower:
     belief : Belief
     innovation : Innovation or None
         Of the latest epoch's rows that entered the track; None where none did, or they placed a vehicle.
-    refuted : bool (V,)
-        Vehicles that are not, or do not head, as they were stated to start: ranges gainsaid it before they bore it out.
     """
 
     def __init__(
@@ -100,7 +98,8 @@ class Follower:
         self._given = np.zeros(len(site.vehicles), bool)
         self._stated = np.zeros(len(site.vehicles), bool)
         self._mirrored = np.zeros(len(site.vehicles), bool)
-        self.refuted = np.zeros(len(site.vehicles), bool)
+        self._gainsaid = np.zeros(len(site.vehicles), bool)
+        self._fixable = np.zeros(len(site.vehicles), bool)
         self._undecided = np.zeros(len(site.vehicles), bool)
         self._course = Course()
         self._banks: dict[int, Bank] = {}
@@ -153,6 +152,14 @@ class Follower:
             replace(self.belief, time_s=time_s), who, position_m, yaw_rad, known, turns, self.motion.tilt_pace_radps
         )
         self.belief = set_out(self.belief)
+
+    @property
+    def refuted(self) -> NDArray[np.bool_]:
+        """Vehicles (V,) that are not, or do not head, as they were stated to start: it was gainsaid, not borne out.
+
+        But for those that nothing else ever placed: they would have no place at all, and may have been pushed.
+        """
+        return self._gainsaid & self._fixable
 
     def unstarted(self, vehicles: NDArray[np.bool_]) -> Follower:
         """Return this follower, at its beginning, without the start of these vehicles (V,) that was refuted."""
@@ -279,11 +286,13 @@ class Follower:
     def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event], judged: bool) -> None:
         """Note whose stated start is gainsaid before it is borne out; ``judged``: so are a vehicle's own sensors."""
         fixed = {found.vehicle for found in fixes if found.status == "ok"}
+        anew = {event.vehicle for event in events if event.event == "reset"}
+        self._fixable |= np.array([vehicle.id in fixed | anew for vehicle in self.site.vehicles], bool)
         for who in np.flatnonzero(self._stated).tolist():
             name = self.site.vehicles[who].id
             told = {event.event for event in events if event.vehicle == name}
             if told & {"reset", "slip"}:
-                self.refuted[who], self._stated[who], self._given[who] = True, False, False
+                self._gainsaid[who], self._stated[who], self._given[who] = True, False, False
             elif name in fixed and not self._undecided[who]:
                 # a heading is borne out by sensors that it makes right (`_heed`)
                 self._given[who], self._stated[who] = False, judged

@@ -79,7 +79,7 @@ def slipped(
         mean, covariance, free = opened.mean.copy(), opened.covariance.copy(), opened.free.copy()
         lift_heading(mean, covariance, free, who)
         opened = replace(opened, mean=mean, covariance=covariance, free=free)
-    opened, again, _, innovation = update(opened, epoch, links, asked, together=False)
+    opened, again, _, innovation = update(opened, epoch, links, asked, pushed=who)
     if np.count_nonzero(again) <= np.count_nonzero(used):
         return None
     apart = np.hypot(*(opened.pose()[who, :2] - before.pose()[who, :2]))

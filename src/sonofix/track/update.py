@@ -34,6 +34,9 @@ ASTRAY = 1e-3
 MANOEUVRE_RADPS2 = 4.0
 """Acceleration (one sigma) of each angle within an epoch."""
 
+PUSHED_MPS2 = 20.0
+"""Acceleration (one sigma) of a vehicle that is being pushed: by a metre in a third of a second."""
+
 BENT = 0.1
 """Share of their own errors by which stated ranges may bend within what places are uncertain by, uniterated."""
 
@@ -44,7 +47,7 @@ def update(
     links: Links,
     candidates: NDArray[np.bool_],
     iterations: int = 20,
-    together: bool = True,
+    pushed: int = -1,
 ) -> tuple[Belief, NDArray[np.bool_], Floats, Innovation | None]:
     """Correct a belief, already predicted to the epoch's instant, by the epoch's rows.
 
@@ -54,9 +57,9 @@ def update(
         Rows worth asking; those that touch a vehicle without a position are left out.
     iterations : int
         At most.
-    together : bool
-        Whether our own ranges are judged together too. Not of a vehicle that is just being pushed: within the epoch it
-        moves as no model has it, and rows heard at different moments disagree.
+    pushed : int
+        A vehicle that is just being pushed (−1: none). Within the epoch it moves as no model has it, by as much as
+        `PUSHED_MPS2`, and rows that were heard at different moments are not judged together.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def update(
     whole, links = links, links.rows(rows)
     mean = belief.mean if belief.about is None else belief.near(belief.about.now, belief.mean)
     shown, derivative = expect(links, belief, mean, dt, epoch, pair)
-    noise = noise_of(belief, epoch, whole, rows, dt, pair, derivative)
+    noise = noise_of(belief, epoch, whole, rows, dt, pair, derivative, pushed)
     trust, claimed = belief.trust if epoch.snr_db is None else None, noise.diagonal().copy()
     if trust is not None:
         noise[np.diag_indices(len(rows))] += trust.extra(pair)
@@ -126,7 +129,7 @@ def update(
     ):
         iterations = 1
     found = _peak(belief, epoch, hearing, iterations, mean, (miss, derivative, crossed))
-    if together and trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
+    if pushed < 0 and trust is None and len(hearing.dt) > 1 and sound_rows.odd(found):
         after, used[rows[near]], found = _sound(belief, epoch, hearing, iterations, mean, found)
         return after, used, surprise, _innovation(belief, found)
     if not found.settled:
@@ -279,6 +282,7 @@ def noise_of(
     dt: Floats,
     pair: NDArray[np.int64],
     derivative: Floats,
+    pushed: int = -1,
 ) -> Floats:
     """Covariance (m, m) of rows as `row_noise` gives it, less what stays with a pair and is followed as a state.
 
@@ -289,7 +293,7 @@ def noise_of(
     others = belief.trust is not None and epoch.snr_db is None
     noise = row_noise(epoch, links, rows, dt, agile_mps2=MANOEUVRE_MPS2 if others else 0.0)
     if not others:
-        seen = _accelerated(belief, derivative, len(rows))
+        seen = _accelerated(belief, derivative, len(rows), pushed)
         noise += seen @ seen.T
     if len(pair):
         at = np.arange(len(rows))
@@ -297,7 +301,7 @@ def noise_of(
     return noise
 
 
-def _accelerated(belief: Belief, derivative: Floats, count: int) -> Floats:
+def _accelerated(belief: Belief, derivative: Floats, count: int, pushed: int) -> Floats:
     """Return what each row (m, k) changes by as a vehicle's place or angle is accelerated, by one deviation each.
 
     A row speaks of a vehicle at w, when it was heard, or sent where the vehicle carries the emitter. By then an
@@ -313,7 +317,8 @@ def _accelerated(belief: Belief, derivative: Floats, count: int) -> Floats:
         when = np.tile(when, len(derivative) // count)[:, None]
         at = places[belief.free[places]]
         rate = at + np.where(at % SIZE < ROLL, 4, 2)
-        sd = np.where(at % SIZE < YAW, MANOEUVRE_MPS2, MANOEUVRE_RADPS2)
+        moves_mps2 = PUSHED_MPS2 if vehicle == pushed else MANOEUVRE_MPS2
+        sd = np.where(at % SIZE < YAW, moves_mps2, MANOEUVRE_RADPS2)
         seen.append(sd * when * (derivative[:, rate] - derivative[:, at] * when / 2))
     return np.hstack([np.zeros((len(derivative), 0)), *seen])
 
