@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sonofix import score
 from sonofix.files import read_recording, read_truth
-from sonofix.flow import run
+from sonofix.flow import run, smoothed
 from sonofix.records import Recording, Step, Truth
 
 
@@ -160,3 +160,15 @@ def test_ranges_hold_where_it_is_fast_or_rough(captures: Path, name: str) -> Non
     assert figures.used.beyond_5cm == 0
     assert figures.used.rms_m is not None
     assert figures.used.rms_m < 5e-3
+
+
+def test_smoothed_no_robot_is_missing(captures: Path) -> None:
+    folder = captures / "team"
+    recording, truths, steps = walked(folder)
+    track = score.track_columns(smoothed(recording, steps))
+    assert set(track) == set(truths)
+    for vehicle, columns in track.items():
+        assert len(columns.time_s) == len(steps)
+        figures = score.score_track(truths[vehicle], columns)
+        assert figures is not None
+        assert figures.rmse_xy_m < 0.03

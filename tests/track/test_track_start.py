@@ -198,6 +198,7 @@ def test_a_pushed_vehicle_that_no_fix_ever_places_keeps_its_start(rng: np.random
         events += [event.event for event in step.events]
         assert not any(found.status == "ok" for found in step.fixes)
     assert events.count("slip") == 1
+    assert not causal.follower.refuted.any()
     track = smooth(begin, heard)
     assert [len(some) for some in track] == [1] * len(heard)
     assert abs(track[-1][0].position_m[1] - 4.0) < 0.05
