@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,34 @@ def test_a_yaw_rate_of_the_wrong_sign_is_found_out(rng: np.random.Generator) -> 
     assert judge(steps, 5.0)[0] < 2.0 * np.sqrt(2.0) * SD_M
     unheard = judge(steps, first.time_s + 1.0, first.time_s + 5.0)
     assert unheard[1] < 2.5
+
+
+@pytest.mark.parametrize(("turn", "off_rad", "found_s"), [(0.2, 0.0, None), (-0.2, 0.0, 15.0), (0.2, 2.2, 6.0)])
+def test_sensors_of_several_vehicles_are_found_out_too(
+    turn: float, off_rad: float, found_s: float | None, rng: np.random.Generator
+) -> None:
+    site = Site.model_validate({"name": "yard", "vehicle": [{"id": "a", "z_m": 0.0}, {"id": "b", "z_m": 0.0}]})
+    names, rows = ("a", "b") * len(TIMES), np.repeat(np.arange(0.0, LAST_S, 0.1), 2)
+    told = np.repeat(at(TIMES), 2, axis=0) + SD_M * rng.standard_normal((len(names), 2))
+    columns = {"time_s": np.repeat(TIMES, 2), "x_m": told[:, 0], "y_m": told[:, 1], "sd_m": np.full(len(told), SD_M)}
+    rates = np.tile([turn, 0.2], len(rows) // 2)
+    wheels = {"time_s": rows, "v_mps": 0.6 + 0 * rows, "yaw_rate_radps": rates}
+    yaw = np.pi / 2 + np.array([off_rad, 0.0])
+    tables = {
+        "positions": Table(columns, {"vehicle": names}),
+        "odometry": Table(wheels, {"vehicle": ("a", "b") * (len(rows) // 2)}),
+        "start": Table({"x_m": np.full(2, 8.0), "y_m": np.full(2, 4.0), "yaw_rad": yaw}, {"vehicle": ("a", "b")}),
+    }
+    steps = list(run(Recording(site=site, tables=tables)))
+    resets = events(steps, "reset")
+    assert all(event.vehicle == "a" for event in resets)
+    assert (resets[0].time_s < found_s) if found_s else not resets
+    a, b = ([replace(s, estimates=tuple(e for e in s.estimates if e.vehicle == v)) for s in steps] for v in "ab")
+    assert judge(b, 10.0)[0] < 0.7 * SD_M
+    error_m, nees = judge(a, 12.0)
+    # with wheels that are wrong for good there are positions alone, √2 sd, and as much until they are found out again
+    assert error_m < (0.7 if turn > 0.0 else 2.0 * np.sqrt(2.0)) * SD_M
+    assert nees < (1.5 if turn > 0.0 else 4.0)
 
 
 def test_sensors_that_are_right_are_heard_throughout(rng: np.random.Generator) -> None:

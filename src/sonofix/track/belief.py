@@ -434,9 +434,14 @@ def reopen(belief: Belief, vehicle: int, far_m: float) -> Belief:
     for i, sd in ((0, far_m), (1, far_m), (4, 1.0), (5, 1.0)):
         covariance[SIZE * vehicle + i, SIZE * vehicle + i] += sd**2
     lift_anchors(belief.inputs, vehicle, mean, covariance, free)
+    return unheard(replace(belief, mean=mean, covariance=covariance, free=free), vehicle, PUSHED_S)
+
+
+def unheard(belief: Belief, vehicle: int, silent_s: float) -> Belief:
+    """Return a belief into which a vehicle's odometry does not enter for a while."""
     deaf_s = np.full(len(belief.placed), -np.inf) if belief.deaf_s is None else belief.deaf_s.copy()
-    deaf_s[vehicle] = belief.time_s + PUSHED_S
-    return replace(belief, mean=mean, covariance=covariance, free=free, deaf_s=deaf_s)
+    deaf_s[vehicle] = belief.time_s + silent_s
+    return replace(belief, deaf_s=deaf_s)
 
 
 def estimate(belief: Belief, site: Site, vehicle: int, source: Source) -> Estimate:

@@ -28,7 +28,7 @@ class Course:
         """Begin to follow the heading of each vehicle that has odometry, a place and no heading, where it is known."""
         if belief.inputs is not None:
             for who in np.flatnonzero(belief.placed & (belief.inputs.wheel_slot >= 0)).tolist():
-                if belief.free[SIZE * who + 3]:
+                if belief.free[SIZE * who + 3] or belief.deaf(who, belief.time_s):
                     self._trails.pop(who, None)
                 else:
                     belief = self._look(belief, who)

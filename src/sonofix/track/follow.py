@@ -112,7 +112,8 @@ class Follower:
         self._alone: Alone | None = None
         self._silence = Silence()
         self._rest = Rest(site)
-        self._positions = Positions(site, inputs is not None and len(inputs.time_s) > 0)
+        sensed = np.zeros(0, int) if inputs is None else inputs.vehicle
+        self._positions = Positions(site, np.isin(np.arange(len(site.vehicles)), sensed))
 
     def copied(self) -> Follower:
         """Return a follower that is as this one is now, and goes its own way from here."""
@@ -224,7 +225,7 @@ class Follower:
         self._weigh(before, epoch, links, candidates & ~taken, events)
         self._judge(epoch, links, used, fixes, events)
         events += self._rest.take(self.belief)
-        self._prove_start(fixes, events, self._judges_sensors)
+        self._prove_start(fixes, events, np.full(len(self._stated), self._judges_sensors))
         return self._estimates(links, used), used, tuple(events)
 
     def _stand(self, fixes: tuple[Fix, ...], events: list[Event]) -> tuple[Estimate, ...]:
@@ -283,8 +284,8 @@ class Follower:
         contests = self._given & np.array([vehicle.id in fixed for vehicle in self.site.vehicles], bool)
         return (contests & self._corrected) | self._undecided
 
-    def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event], judged: bool) -> None:
-        """Note whose stated start is gainsaid before it is borne out; ``judged``: so are a vehicle's own sensors."""
+    def _prove_start(self, fixes: tuple[Fix, ...], events: list[Event], judged: NDArray[np.bool_]) -> None:
+        """Note whose stated start is gainsaid before it is borne out; ``judged`` (V,): so are its own sensors."""
         fixed = {found.vehicle for found in fixes if found.status == "ok"}
         anew = {event.vehicle for event in events if event.event == "reset"}
         self._fixable |= np.array([vehicle.id in fixed | anew for vehicle in self.site.vehicles], bool)
@@ -295,7 +296,7 @@ class Follower:
                 self._gainsaid[who], self._stated[who], self._given[who] = True, False, False
             elif name in fixed and not self._undecided[who]:
                 # a heading is borne out by sensors that it makes right (`_heed`)
-                self._given[who], self._stated[who] = False, judged
+                self._given[who], self._stated[who] = False, bool(judged[who])
 
     def _doubt_wheels(
         self, before: Belief, epoch: RangeEpoch, links: Links, asked: NDArray[np.bool_], events: list[Event]

@@ -42,7 +42,7 @@ class Taken:
     """What a position did: the belief and what is known of noise after it, and how it lay.
 
     ``told`` is the logarithm of how likely the position was before, over that of one that may be anything; ``free`` the
-    same to the members of `Scatter`, 0 where a vehicle's sensors lead it. ``off`` is by how many deviations and
+    same to the members of `Scatter`. ``led``: the vehicle's own sensors lead it. ``off`` is by how many deviations and
     ``off_m`` by how many metres it is off.
     """
 
@@ -50,6 +50,7 @@ class Taken:
     scatter: Scatter
     told: float
     free: float
+    led: bool
     off: float
     off_m: float
     rows: int
@@ -78,12 +79,11 @@ def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
     spread = crossed @ derivative.T
     judged, told = scatter.judged(miss, spread, stated)
     if scatter.state is None:  # it was placed by its stated start
-        scatter, free = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), SPEED_SD_MPS), 0.0
+        scatter, free = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), SPEED_SD_MPS), told
     else:
         scatter, free = scatter.taken(belief.time_s, fix.position_m[:2], _level_m2(fix))
-    if led(belief, vehicle):
-        # the members hear no sensor, and tell less
-        scatter, free = replace(scatter, heard=judged.heard), 0.0
+    leads = led(belief, vehicle)
+    scatter = replace(scatter, led=judged.led if leads else None)
     noise = scatter.scale**2 * stated
     off = float(np.sqrt(miss @ np.linalg.solve(spread + noise, miss)))
     off_m = float(np.linalg.norm(miss))
@@ -91,7 +91,7 @@ def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
         gain = np.linalg.solve(spread + noise, crossed).T
         covariance = joseph(belief.covariance, gain, derivative, noise)
         belief = replace(belief, mean=belief.mean + gain @ miss, covariance=covariance)
-    return Taken(belief, scatter, told, free, off, off_m, len(axes))
+    return Taken(belief, scatter, told, free, leads, off, off_m, len(axes))
 
 
 def _level_m2(fix: Fix) -> float:
@@ -107,6 +107,7 @@ def led(belief: Belief, vehicle: int) -> bool:
         return False
     # wheels lead along a heading
     headed = inputs.wheel_slot[vehicle] >= 0 and bool(belief.free[SIZE * vehicle + YAW])
+    headed = headed and not belief.deaf(vehicle, belief.time_s)
     step = int(inputs.step_slot[vehicle])
     return bool(headed or (step >= 0 and belief.free[step]))
 

@@ -1,7 +1,8 @@
 """Vehicles that are followed by positions which others computed: what these gainsay, and what gainsays them.
 
-Beside the track run at most two others of a vehicle: one where positions put it that the track did not believe, until
-either is likelier by far, and of a site's only vehicle one that hears no sensor (`alone`).
+Beside the track runs at most one other of each vehicle, where positions put it that the track did not believe, until
+either is likelier by far. Whether a vehicle's own sensors are right is told by a track that hears none: of a site's
+only vehicle one that keeps all else that is known (`alone`), of several the small filters of each (`scatter`).
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from sonofix.geometry import SIZE, turning
 from sonofix.records import Event, Fix, Innovation
 from sonofix.site import Site
 from sonofix.track import loose
-from sonofix.track.alone import Alone, Silence, unled
-from sonofix.track.belief import Belief, Motion, place, predict
+from sonofix.track.alone import BORNE_OUT, OUTDONE, Alone, Silence, unled
+from sonofix.track.belief import Belief, Motion, place, predict, unheard
 from sonofix.track.gaps import Gaps
 from sonofix.track.loose import Elsewhere, Taken
 from sonofix.track.rival import bare, follows
@@ -29,8 +30,8 @@ class Positions:
 
     Attributes
     ----------
-    judges : bool
-        Whether a track by positions alone tells whether the sensors of the only vehicle are right.
+    judges : bool (V,)
+        Vehicles of which positions tell whether their own sensors are right.
     contested : bool (V,)
         Vehicles that positions put elsewhere, with neither place decided for.
     borne_out : bool (V,)
@@ -39,9 +40,10 @@ class Positions:
         Of the latest positions that entered together.
     """
 
-    def __init__(self, site: Site, sensed: bool) -> None:
+    def __init__(self, site: Site, sensed: NDArray[np.bool_]) -> None:
+        """Begin; ``sensed`` (V,) are vehicles with sensors of their own."""
         count = len(site.vehicles)
-        self.judges = sensed and count == 1
+        self.judges = sensed
         self.contested = np.zeros(count, bool)
         self.borne_out = np.zeros(count, bool)
         self._ids = [vehicle.id for vehicle in site.vehicles]
@@ -49,15 +51,15 @@ class Positions:
         self._turns = bool(count and turning(site)[0])
         self._scatter = [scatter()] * count
         self._elsewhere: list[Elsewhere | None] = [None] * count
-        self._behind = np.zeros(count)
+        self._behind, self._sum = np.zeros(count), np.zeros(count)
         self._alone: tuple[Alone, Scatter] | None = None
-        self._silence = Silence()
+        self._silence = [Silence() for _ in range(count)]
         self._gaps = Gaps(self._ids)
         self.innovation: Innovation | None = None
 
     def knowing(self, other: Positions) -> None:
         """Begin with how positions erred by another's end."""
-        self._scatter = [replace(scatter(), heard=known.heard) for known in other._scatter]
+        self._scatter = [replace(scatter(), heard=known.heard, led=known.led) for known in other._scatter]
 
     def take(
         self, belief: Belief, motion: Motion, fixes: Sequence[Fix], unproven: Sequence[bool]
@@ -74,8 +76,8 @@ class Positions:
                 continue
             if not belief.placed[who]:
                 belief, self._scatter[who] = loose.put(belief, self._scatter[who], who, found, self._speed_sd_mps[who])
-                self._elsewhere[who], self.contested[who], entered[who] = None, False, True
-                self._alone = None
+                self._settle(who)
+                entered[who] = True
                 self._tell(events, belief, who, "start", "first position")
                 continue
             known = self._scatter[who]
@@ -87,7 +89,9 @@ class Positions:
             if not entered[who]:
                 text = f"a position {track.off_m:.2f} m, {track.off:.1f} deviations from the track: not believed"
                 events.append(Event(belief.time_s, self._ids[who], "excluded", text))
-            if self.judges:
+            if len(fixes) > 1:
+                belief = self._doubt(belief, track, who, found, bool(unproven[who]), events)
+            elif self.judges[who]:
                 belief = self._heed(belief, track, found, motion, bool(unproven[who]), events)
         self.innovation = Innovation(belief.time_s, rows, nis) if rows else None
         return belief, entered, events
@@ -97,20 +101,19 @@ class Positions:
     ) -> tuple[Belief, bool]:
         """Follow another place that positions tell, as long as either may be true; return whether this one entered."""
         # by how much positions in a row that the track did not believe were likelier without it
-        self._behind[who] = 0.0 if track.believed else self._behind[who] + track.free - track.told
+        if not track.led:
+            self._behind[who] = 0.0 if track.believed else self._behind[who] + track.free - track.told
         other = self._elsewhere[who]
         if other is not None:
             other = other.taken(track, who, found, motion)
         if other is not None and other.won:
-            self._elsewhere[who], self.contested[who], self._alone = None, False, None
-            self._behind[who] = 0.0
+            self._settle(who)
             self._scatter[who] = other.scatter
             belief = place(track.belief, who, other.fix(who, found), np.zeros(2))
             self._tell(events, belief, who, "reset", "positions disagreed with the track")
             return belief, True
-        if self._behind[who] > loose.DECIDED:
-            self._elsewhere[who], self.contested[who], self._alone = None, False, None
-            self._behind[who] = 0.0
+        if not track.led and self._behind[who] > loose.DECIDED:
+            self._settle(who)
             belief = place(track.belief, who, loose.freely(track.scatter, found), np.zeros(2))
             self._tell(events, belief, who, "reset", f"positions err {track.scatter.scale:.1f} times as stated")
             return belief, True
@@ -127,7 +130,7 @@ class Positions:
         """Hear the only vehicle's own sensors only as long as positions are not far likelier without them."""
         now_s = belief.time_s
         if not belief.heeded:
-            if self._silence.over(now_s):
+            if self._silence[0].over(now_s):
                 belief = replace(belief, heeded=True)
                 self._alone = unled(belief, self._turns), self._scatter[0]
             return belief
@@ -155,9 +158,37 @@ class Positions:
                 self._alone = unled(belief, self._turns), taken.scatter
                 why = "positions gainsay how it was stated to start"
             else:
-                why = f"positions gainsay its own sensors, unheard for {self._silence.begin(now_s):g} s"
+                why = f"positions gainsay its own sensors, unheard for {self._silence[0].begin(now_s):g} s"
             self._tell(events, belief, 0, "reset", why)
         return belief
+
+    def _doubt(self, belief: Belief, track: Taken, who: int, found: Fix, unproven: bool, events: list[Event]) -> Belief:
+        """Put one of several vehicles where its positions have it, where these are far likelier without its sensors."""
+        if not track.led or self.contested[who]:
+            return belief
+        news = track.free - track.told
+        self._behind[who], self._sum[who] = max(self._behind[who] + news, 0.0), self._sum[who] + news
+        if self._sum[who] < -BORNE_OUT:
+            self.borne_out[who] = True
+        if self._behind[who] <= OUTDONE:
+            return belief
+        self._settle(who)
+        known = replace(track.scatter, led=None)
+        self._scatter[who] = known
+        belief = place(belief, who, loose.freely(known, found), np.zeros(2))
+        driven = belief.inputs is not None and bool(belief.inputs.wheel_slot[who] >= 0)
+        why = "positions gainsay how it was stated to start" if unproven else "positions gainsay its own sensors"
+        if driven and not unproven:
+            silent_s = self._silence[who].begin(belief.time_s)
+            belief = unheard(belief, who, silent_s)
+            why += f", unheard for {silent_s:g} s"
+        self._tell(events, belief, who, "reset", why)
+        return belief
+
+    def _settle(self, who: int) -> None:
+        """Forget what gainsaid a vehicle's track, which begins anew."""
+        self._elsewhere[who], self.contested[who], self._alone = None, False, None
+        self._behind[who], self._sum[who] = 0.0, 0.0
 
     def _tell(self, events: list[Event], belief: Belief, who: int, word: str, why: str) -> None:
         """Tell where a vehicle was put."""

@@ -3,8 +3,9 @@
 A vehicle that moves freely and positions that err look alike in one innovation; in a row of them they do not (Mehra
 1970). So small filters of the vehicle's place and velocity run beside the track, each with a scale and an agility of
 its own, and how likely each found what came weighs it (multiple-model estimation: Magill 1965). Where a vehicle's own
-sensors lead the track, its own innovations tell the scale better. All of this fades, so that the scale follows noise
-that changes. A position may also be anything, so that one outlier tells next to nothing.
+sensors lead the track, its own innovations tell the scale better; what the small filters heard is kept apart from that,
+so that they can gainsay it. All of this fades, so that the scale follows noise that changes. A position may also be
+anything, so that one outlier tells next to nothing.
 """
 
 from __future__ import annotations
@@ -50,24 +51,25 @@ class Scatter:
         Of each member x, y and their velocities, [place or velocity, axis]; None before a first position.
     covariance : float64 (24, 5, 2, 2)
         Of place and velocity, the same along both axes.
+    led : float64 (24, 1) or None
+        As ``heard``, by a track that a vehicle's own sensors lead; None where none do.
     """
 
     heard: Floats
     time_s: float = 0.0
     state: Floats | None = None
     covariance: Floats | None = None
+    led: Floats | None = None
 
     @property
     def weight(self) -> Floats:
         """How likely each scale is (24,)."""
-        return self._members.sum(axis=1)
+        return (self._members if self.led is None else _weighed(self.led)).sum(axis=1)
 
     @property
     def _members(self) -> Floats:
         """How likely each member is (24, 5)."""
-        log = self.heard - PRIOR * np.log(SCALES)[:, None]
-        weight = np.exp(log - log.max())
-        return weight / weight.sum()
+        return _weighed(self.heard)
 
     @property
     def scale(self) -> float:
@@ -81,7 +83,7 @@ class Scatter:
         covariance = np.zeros_like(state)
         covariance[:, :, 0, 0] = variance_m2 * SCALES[:, None] ** 2
         covariance[:, :, 1, 1] = speed_sd_mps**2
-        return Scatter(self.heard, time_s, state, covariance)
+        return replace(self, time_s=time_s, state=state, covariance=covariance)
 
     def taken(self, time_s: float, place_m: Floats, variance_m2: float) -> tuple[Scatter, float]:
         """Return what is known once a position (2,) of a stated variance came, by the members.
@@ -107,10 +109,10 @@ class Scatter:
         state = state + gain[..., None] * miss[..., None, :]
         told = np.logaddexp(sized, stray(2))
         likely = float(np.log(np.sum(self._members * np.exp(told - stray(2)))))
-        return replace(self._told(told), time_s=time_s, state=state, covariance=covariance), likely
+        return Scatter(_told(self.heard, told), time_s, state, covariance, self.led), likely
 
     def judged(self, miss_m: Floats, spread_m2: Floats, stated_m2: Floats) -> tuple[Scatter, float]:
-        """Return what is known once a position came, by the track itself, and how likely that was, as `taken` does.
+        """Return what is known once a position came, by a track that sensors lead, and how likely it was, as `taken`.
 
         ``miss_m`` (d,) is by how much it is off the track, ``spread_m2`` (d, d) the covariance of what the track
         expects, ``stated_m2`` (d, d) that which the position states.
@@ -121,7 +123,11 @@ class Scatter:
         )
         sized = np.log(1.0 - STRAY) - 0.5 * (surprise + np.linalg.slogdet(2.0 * np.pi * each)[1])
         told = np.logaddexp(sized, stray(len(miss_m)))
-        return self._told(told[:, None]), float(np.log(self.weight @ np.exp(told - stray(len(miss_m)))))
+        weight = self.weight
+        # what the members learnt before sensors led goes on
+        led = np.maximum(np.log(weight) + PRIOR * np.log(SCALES), -UNDONE)[:, None] if self.led is None else self.led
+        likely = float(np.log(weight @ np.exp(told - stray(len(miss_m)))))
+        return replace(self, led=_told(led, told[:, None])), likely
 
     def mixed(self) -> tuple[Floats, Floats]:
         """Return the mean (2, 2) of all members, place and velocity, and its covariance (4, 4) with their scatter."""
@@ -133,9 +139,17 @@ class Scatter:
         within = np.kron(np.einsum("sq,sqij->ij", weight, self.covariance), np.eye(2))
         return mean, within + np.einsum("sq,sqi,sqj->ij", weight, apart, apart)
 
-    def _told(self, told: Floats) -> Scatter:
-        heard = (1.0 - 1.0 / REMEMBERED) * self.heard + told
-        return replace(self, heard=np.maximum(heard - heard.max(), -UNDONE))
+
+def _weighed(heard: Floats) -> Floats:
+    """Return how likely each is that found what came as likely as ``heard``."""
+    log = heard - PRIOR * np.log(SCALES)[:, None]
+    weight = np.exp(log - log.max())
+    return weight / weight.sum()
+
+
+def _told(heard: Floats, told: Floats) -> Floats:
+    heard = (1.0 - 1.0 / REMEMBERED) * heard + told
+    return np.maximum(heard - heard.max(), -UNDONE)
 
 
 def stray(axes: int) -> float:
