@@ -65,6 +65,30 @@ def test_a_start_that_is_elsewhere_is_not_told(rng: np.random.Generator) -> None
     assert after[0].estimates  # a start that was refuted leaves no hole
 
 
+@pytest.mark.parametrize("turn", [None, 0.2])
+@pytest.mark.parametrize("off_m", [1.0, 2.0, 3.0, 4.2, 6.0])
+def test_no_row_tells_a_start_that_is_off(off_m: float, turn: float | None, rng: np.random.Generator) -> None:
+    nees: list[float] = []
+    for _ in range(8):
+        steps = list(run(made(noisy(rng), turn, start={"x_m": 8.0 + off_m, "y_m": 4.0, "yaw_rad": np.pi / 2})))
+        early = [e for step in steps for e in step.estimates if e.time_s < 1.0]
+        assert all(np.hypot(*(e.position_m[:2] - at(np.array([e.time_s]))[0])) < 0.7 * off_m for e in early)
+        assert any(step.estimates for step in steps if step.ranges.sync_s < 10 * PERIOD_S)
+        if any(step.estimates for step in steps if step.ranges.sync_s <= 6.0):
+            nees.append(judge(steps, 0.0, 6.0)[1])
+    assert np.mean(nees) < 5.0
+
+
+def test_a_start_that_is_right_is_told_at_once(rng: np.random.Generator) -> None:
+    since_s = []
+    for _ in range(16):
+        steps = list(run(made(noisy(rng), start={"x_m": 8.0, "y_m": 4.0, "yaw_rad": np.pi / 2})))
+        assert not events(steps, "reset")
+        since_s.append(min(e.time_s for step in steps for e in step.estimates))
+    assert np.median(since_s) == 0.0
+    assert max(since_s) <= 3 * PERIOD_S
+
+
 def test_a_start_that_is_right_is_kept_through_an_outlier(rng: np.random.Generator) -> None:
     told = noisy(rng)
     told[0] += (6.0, -5.0)

@@ -15,7 +15,7 @@ from sonofix.records import Fix
 from sonofix.track.belief import Belief, Motion, place, predict
 from sonofix.track.kernel import joseph
 from sonofix.track.rival import bare
-from sonofix.track.scatter import Scatter
+from sonofix.track.scatter import ROOM_M, Scatter
 
 UNLIKELY = 4.0
 """Distance of a position from the track, in deviations, beyond which it is not believed: noise alone comes
@@ -29,6 +29,12 @@ JUMPS = float(np.log(1e-3))
 
 DECIDED = 7.0
 """Difference of log likelihoods at which one of two places is dropped: odds of a thousand to one."""
+
+DOUBTED = 2.0
+"""Distance of a first position from a stated start, in deviations, beyond which the two contest."""
+
+AROUND = 2.0 * np.pi * float(np.log(1e3))
+"""Of a density that is the same for each logarithm of a distance between 0.1 and 100 m: that times its square."""
 
 AGREEING = 3
 """Positions that another place takes at least: an outlier may come twice."""
@@ -77,6 +83,10 @@ def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
     stated = fix.covariance[np.ix_(rows, rows)]
     crossed = derivative @ belief.covariance
     spread = crossed @ derivative.T
+    # a miss that swells the noise may not by that be believed
+    noise = scatter.scale**2 * stated
+    off = float(np.sqrt(miss @ np.linalg.solve(spread + noise, miss)))
+    off_m = float(np.linalg.norm(miss))
     judged, told = scatter.judged(miss, spread, stated)
     if scatter.state is None:  # it was placed by its stated start
         scatter, free = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), SPEED_SD_MPS), told
@@ -84,10 +94,8 @@ def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
         scatter, free = scatter.taken(belief.time_s, fix.position_m[:2], _level_m2(fix))
     leads = led(belief, vehicle)
     scatter = replace(scatter, led=judged.led if leads else None)
-    noise = scatter.scale**2 * stated
-    off = float(np.sqrt(miss @ np.linalg.solve(spread + noise, miss)))
-    off_m = float(np.linalg.norm(miss))
     if off <= UNLIKELY:
+        noise = scatter.scale**2 * stated
         gain = np.linalg.solve(spread + noise, crossed).T
         covariance = joseph(belief.covariance, gain, derivative, noise)
         belief = replace(belief, mean=belief.mean + gain @ miss, covariance=covariance)
@@ -139,9 +147,14 @@ class Elsewhere:
 
     @classmethod
     def begun(cls, track: Taken, known: Scatter, vehicle: int, fix: Fix, speed_sd_mps: float) -> Elsewhere:
-        """Begin where a fix puts a vehicle that the track did not take; ``known`` is how such fixes erred before."""
+        """Begin where a fix puts a vehicle; ``known`` is how such fixes erred before.
+
+        The track did not take it, or this is the first one after a stated start. That is wrong as often as a fix is,
+        and then by centimetres as likely as by tens of metres: the logarithm of how far has no size of its own.
+        """
         begun = put(bare(replace(track.belief, heeded=False)), known, vehicle, fix, speed_sd_mps)
-        return cls(*begun, JUMPS - track.told)
+        why = JUMPS if known.state is not None else track.rows * np.log(ROOM_M / track.off_m) - np.log(AROUND)
+        return cls(*begun, float(why) - track.told)
 
     def taken(self, track: Taken, vehicle: int, fix: Fix, motion: Motion) -> Elsewhere:
         """Follow a fix that was shown to the track, too."""

@@ -117,7 +117,8 @@ class Positions:
             belief = place(track.belief, who, loose.freely(track.scatter, found), np.zeros(2))
             self._tell(events, belief, who, "reset", f"positions err {track.scatter.scale:.1f} times as stated")
             return belief, True
-        if (other is None or other.lost) and not track.believed:
+        doubted = known.state is None and track.off > loose.DOUBTED
+        if (other is None or other.lost) and (doubted or not track.believed):
             other = Elsewhere.begun(track, known, who, found, self._speed_sd_mps[who])
         elif other is not None and other.lost:
             other = None
