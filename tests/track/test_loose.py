@@ -17,7 +17,7 @@ from sonofix.site import Site
 from sonofix.track.belief import blank, place, predict
 from sonofix.track.follow import Follower
 from sonofix.track.loose import take
-from sonofix.track.scatter import scatter
+from sonofix.track.spreads import spreads
 
 SD_M, PERIOD_S = 0.2, 0.5
 
@@ -86,7 +86,7 @@ def test_a_position_enters_as_two_measurements_of_place(seed: int) -> None:
     begun = predict(place(blank(site), 0, first, np.zeros(2)), 1.0, follower.motion)
     noise = half @ half.T + 0.01 * np.eye(2)
     told = made_fix(site, np.array([3.0, 4.0]) + 0.1 * rng.standard_normal(2), noise)
-    taken = take(begun, scatter(), 0, told)
+    taken = take(begun, spreads(), 0, told)
     assert taken.believed
     after, noise = taken.belief, taken.scatter.scale**2 * noise
     # information adds up

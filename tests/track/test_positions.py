@@ -185,6 +185,24 @@ def test_noise_that_is_larger_than_stated_is_learnt_at_once(turn: float | None, 
     assert worst < 8.0
 
 
+@pytest.mark.parametrize("turn", [None, 0.2])
+@pytest.mark.parametrize("times", [1.0, 3.0, 5.0])
+def test_height_errs_by_a_scale_of_its_own(times: float, turn: float | None, rng: np.random.Generator) -> None:
+    told, resets, squared = noisy(rng), 0, []
+    for _ in range(3):
+        level = made(told, turn)
+        columns = level.tables["positions"].columns | {"z_m": 1.1 + times * SD_M * rng.standard_normal(len(TIMES))}
+        there = Recording(site=make_site(HALL), tables=level.tables | {"positions": Table(columns)})
+        steps = list(run(there))
+        resets += len(events(steps, "reset"))
+        late = [e for step in steps for e in step.estimates if e.time_s >= 10.0]
+        squared += [(e.position_m[2] - 1.1) ** 2 / e.covariance[2, 2] for e in late]
+        # what errs in height takes nothing from the level
+        assert judge(steps, 10.0)[0] < 1.1 * judge(list(run(level)), 10.0)[0]
+    assert resets <= 1
+    assert np.mean(squared) < 2.0
+
+
 def test_positions_that_stop_and_come_back_are_told(rng: np.random.Generator) -> None:
     site = Site.model_validate({"name": "yard", "vehicle": [{"id": "a", "z_m": 0.0}, {"id": "b", "z_m": 0.0}]})
     there = (TIMES < 15.0) | (TIMES >= 25.0)

@@ -15,7 +15,8 @@ from sonofix.records import Fix
 from sonofix.track.belief import Belief, Motion, place, predict
 from sonofix.track.kernel import joseph
 from sonofix.track.rival import bare
-from sonofix.track.scatter import ROOM_M, Scatter
+from sonofix.track.scatter import ROOM_M
+from sonofix.track.spreads import Spreads
 
 UNLIKELY = 4.0
 """Distance of a position from the track, in deviations, beyond which it is not believed: noise alone comes
@@ -48,12 +49,12 @@ class Taken:
     """What a position did: the belief and what is known of noise after it, and how it lay.
 
     ``told`` is the logarithm of how likely the position was before, over that of one that may be anything; ``free`` the
-    same to the members of `Scatter`. ``led``: the vehicle's own sensors lead it. ``off`` is by how many deviations and
+    same to the members of `Spreads`. ``led``: the vehicle's own sensors lead it. ``off`` is by how many deviations and
     ``off_m`` by how many metres it is off.
     """
 
     belief: Belief
-    scatter: Scatter
+    scatter: Spreads
     told: float
     free: float
     led: bool
@@ -68,7 +69,7 @@ class Taken:
         return self.off <= UNLIKELY
 
 
-def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
+def take(belief: Belief, scatter: Spreads, vehicle: int, fix: Fix) -> Taken:
     """Learn from a fix of that instant how far such fixes err, and correct where a vehicle is by it, if it is believed.
 
     The track follows the vehicle's origin, of which a fix tells.
@@ -76,36 +77,28 @@ def take(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix) -> Taken:
     assert fix.position_m is not None
     assert fix.covariance is not None
     at, n = SIZE * vehicle, len(belief.mean)
-    axes = [i for i, name in enumerate("xyz") if name in fix.states and belief.free[at + i]]
-    rows = [fix.states.index("xyz"[i]) for i in axes]
-    miss = (fix.position_m - belief.mean[at : at + 3])[axes]
-    derivative = np.eye(n)[[at + i for i in axes]]
-    stated = fix.covariance[np.ix_(rows, rows)]
+    own = [i for i, name in enumerate("xyz") if name in fix.states and belief.free[at + i]]
+    miss = (fix.position_m - belief.mean[at : at + 3])[own]
+    derivative, axes = np.eye(n)[[at + i for i in own]], ["xyz"[i] for i in own]
     crossed = derivative @ belief.covariance
     spread = crossed @ derivative.T
     # a miss that swells the noise may not by that be believed
-    noise = scatter.scale**2 * stated
+    noise = scatter.noise(fix, axes)
     off = float(np.sqrt(miss @ np.linalg.solve(spread + noise, miss)))
     off_m = float(np.linalg.norm(miss))
-    judged, told = scatter.judged(miss, spread, stated)
-    if scatter.state is None:  # it was placed by its stated start
-        scatter, free = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), SPEED_SD_MPS), told
+    judged, told = scatter.judged(miss, spread, fix, axes)
+    if scatter.begins:  # it was placed by its stated start
+        scatter, free = scatter.begun(belief.time_s, fix, SPEED_SD_MPS), told
     else:
-        scatter, free = scatter.taken(belief.time_s, fix.position_m[:2], _level_m2(fix))
+        scatter, free = scatter.taken(belief.time_s, fix)
     leads = led(belief, vehicle)
-    scatter = replace(scatter, led=judged.led if leads else None)
+    scatter = scatter.led(judged if leads else None)
     if off <= UNLIKELY:
-        noise = scatter.scale**2 * stated
+        noise = scatter.noise(fix, axes)
         gain = np.linalg.solve(spread + noise, crossed).T
         covariance = joseph(belief.covariance, gain, derivative, noise)
         belief = replace(belief, mean=belief.mean + gain @ miss, covariance=covariance)
     return Taken(belief, scatter, told, free, leads, off, off_m, len(axes))
-
-
-def _level_m2(fix: Fix) -> float:
-    """Variance of x and y that a fix states, in the mean."""
-    assert fix.covariance is not None
-    return float(np.mean([fix.covariance[i, i] for i, name in enumerate(fix.states) if name in ("x", "y")]))
 
 
 def led(belief: Belief, vehicle: int) -> bool:
@@ -120,15 +113,15 @@ def led(belief: Belief, vehicle: int) -> bool:
     return bool(headed or (step >= 0 and belief.free[step]))
 
 
-def put(belief: Belief, scatter: Scatter, vehicle: int, fix: Fix, speed_sd_mps: float) -> tuple[Belief, Scatter]:
+def put(belief: Belief, scatter: Spreads, vehicle: int, fix: Fix, speed_sd_mps: float) -> tuple[Belief, Spreads]:
     """Put a vehicle where a fix says, moving anyhow, and forget what was believed of it."""
     assert fix.position_m is not None
     assert fix.covariance is not None
-    wider = replace(fix, covariance=scatter.scale**2 * fix.covariance)
+    wider = replace(fix, covariance=scatter.noise(fix, fix.states))
     belief = place(belief, vehicle, wider, np.zeros(2))
     covariance, at = belief.covariance.copy(), SIZE * vehicle + 4
     covariance[at, at] = covariance[at + 1, at + 1] = speed_sd_mps**2
-    scatter = scatter.begun(belief.time_s, fix.position_m[:2], _level_m2(fix), speed_sd_mps)
+    scatter = scatter.begun(belief.time_s, fix, speed_sd_mps)
     return replace(belief, covariance=covariance), scatter
 
 
@@ -140,20 +133,20 @@ class Elsewhere:
     """
 
     belief: Belief
-    scatter: Scatter
+    scatter: Spreads
     ahead: float
     count: int = 1
     follows: bool = True
 
     @classmethod
-    def begun(cls, track: Taken, known: Scatter, vehicle: int, fix: Fix, speed_sd_mps: float) -> Elsewhere:
+    def begun(cls, track: Taken, known: Spreads, vehicle: int, fix: Fix, speed_sd_mps: float) -> Elsewhere:
         """Begin where a fix puts a vehicle; ``known`` is how such fixes erred before.
 
         The track did not take it, or this is the first one after a stated start. That is wrong as often as a fix is,
         and then by centimetres as likely as by tens of metres: the logarithm of how far has no size of its own.
         """
         begun = put(bare(replace(track.belief, heeded=False)), known, vehicle, fix, speed_sd_mps)
-        why = JUMPS if known.state is not None else track.rows * np.log(ROOM_M / track.off_m) - np.log(AROUND)
+        why = JUMPS if not known.begins else track.rows * np.log(ROOM_M / track.off_m) - np.log(AROUND)
         return cls(*begun, float(why) - track.told)
 
     def taken(self, track: Taken, vehicle: int, fix: Fix, motion: Motion) -> Elsewhere:
@@ -186,19 +179,15 @@ class Elsewhere:
         )
 
 
-def freely(scatter: Scatter, like: Fix) -> Fix:
-    """Return what the members of `Scatter` say of a vehicle's place and velocity, as a fix; its height is as told."""
+def freely(scatter: Spreads, like: Fix) -> Fix:
+    """Return what the members of `Spreads` say of a vehicle's place and velocity, as a fix."""
     assert like.position_m is not None
-    assert like.covariance is not None
-    (place_m, velocity_mps), level = scatter.mixed()
-    covariance = np.zeros((len(like.states) + 2,) * 2)
-    covariance[:4, :4] = level
+    (place_m, velocity_mps), level = scatter.level.mixed()
+    place_m, velocity_mps = np.append(place_m, like.position_m[2]), np.append(velocity_mps, 0.0)
+    covariance, states = level, ("x", "y", "vx", "vy")
     if "z" in like.states:
-        covariance[4, 4] = scatter.scale**2 * like.covariance[2, 2]
-    return replace(
-        like,
-        states=("x", "y", "vx", "vy", "z")[: len(covariance)],
-        position_m=np.append(place_m, like.position_m[2]),
-        velocity_mps=np.append(velocity_mps, 0.0),
-        covariance=covariance,
-    )
+        upwards, height = scatter.height.mixed()
+        place_m[2], velocity_mps[2] = upwards.ravel()
+        covariance, states = np.zeros((6, 6)), (*states, "z", "vz")
+        covariance[:4, :4], covariance[4:, 4:] = level, height
+    return replace(like, states=states, position_m=place_m, velocity_mps=velocity_mps, covariance=covariance)

@@ -22,7 +22,7 @@ from sonofix.track.belief import Belief, Motion, place, predict, unheard
 from sonofix.track.gaps import Gaps
 from sonofix.track.loose import Elsewhere, Taken
 from sonofix.track.rival import bare, follows
-from sonofix.track.scatter import Scatter, scatter
+from sonofix.track.spreads import Spreads, spreads
 
 
 class Positions:
@@ -49,17 +49,17 @@ class Positions:
         self._ids = [vehicle.id for vehicle in site.vehicles]
         self._speed_sd_mps = [v.max_speed_mps or loose.SPEED_SD_MPS for v in site.vehicles]
         self._turns = bool(count and turning(site)[0])
-        self._scatter = [scatter()] * count
+        self._scatter = [spreads()] * count
         self._elsewhere: list[Elsewhere | None] = [None] * count
         self._behind, self._sum = np.zeros(count), np.zeros(count)
-        self._alone: tuple[Alone, Scatter] | None = None
+        self._alone: tuple[Alone, Spreads] | None = None
         self._silence = [Silence() for _ in range(count)]
         self._gaps = Gaps(self._ids)
         self.innovation: Innovation | None = None
 
     def knowing(self, other: Positions) -> None:
         """Begin with how positions erred by another's end."""
-        self._scatter = [replace(scatter(), heard=known.heard, led=known.led) for known in other._scatter]
+        self._scatter = [known.kept() for known in other._scatter]
 
     def take(
         self, belief: Belief, motion: Motion, fixes: Sequence[Fix], unproven: Sequence[bool]
@@ -97,7 +97,7 @@ class Positions:
         return belief, entered, events
 
     def _contest(
-        self, track: Taken, known: Scatter, who: int, found: Fix, motion: Motion, events: list[Event]
+        self, track: Taken, known: Spreads, who: int, found: Fix, motion: Motion, events: list[Event]
     ) -> tuple[Belief, bool]:
         """Follow another place that positions tell, as long as either may be true; return whether this one entered."""
         # by how much positions in a row that the track did not believe were likelier without it
@@ -117,7 +117,7 @@ class Positions:
             belief = place(track.belief, who, loose.freely(track.scatter, found), np.zeros(2))
             self._tell(events, belief, who, "reset", f"positions err {track.scatter.scale:.1f} times as stated")
             return belief, True
-        doubted = known.state is None and track.off > loose.DOUBTED
+        doubted = known.begins and track.off > loose.DOUBTED
         if (other is None or other.lost) and (doubted or not track.believed):
             other = Elsewhere.begun(track, known, who, found, self._speed_sd_mps[who])
         elif other is not None and other.lost:
@@ -174,7 +174,7 @@ class Positions:
         if self._behind[who] <= OUTDONE:
             return belief
         self._settle(who)
-        known = replace(track.scatter, led=None)
+        known = track.scatter.led(None)
         self._scatter[who] = known
         belief = place(belief, who, loose.freely(known, found), np.zeros(2))
         driven = belief.inputs is not None and bool(belief.inputs.wheel_slot[who] >= 0)

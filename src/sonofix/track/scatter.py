@@ -40,17 +40,17 @@ ROOM_M = 100.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """What is known of how far the positions of one vehicle err; a new one with each.
+    """What is known of how far the positions of one vehicle err along some axes; a new one with each.
 
     Attributes
     ----------
     heard : float64 (24, 5)
         Logarithms of how likely each of `SCALES` and `AGILE` found what came, faded.
     time_s : float
-    state : float64 (24, 5, 2, 2) or None
-        Of each member x, y and their velocities, [place or velocity, axis]; None before a first position.
+    state : float64 (24, 5, 2, d) or None
+        Of each member the place along d axes and its velocity, [place or velocity, axis]; None before a first position.
     covariance : float64 (24, 5, 2, 2)
-        Of place and velocity, the same along both axes.
+        Of place and velocity, the same along each axis.
     led : float64 (24, 1) or None
         As ``heard``, by a track that a vehicle's own sensors lead; None where none do.
     """
@@ -77,16 +77,16 @@ class Scatter:
         return float(np.sqrt(self.weight @ SCALES**2))
 
     def begun(self, time_s: float, place_m: Floats, variance_m2: float, speed_sd_mps: float) -> Scatter:
-        """Return what is known where a vehicle was put, at a position (2,) of a stated variance, and moves anyhow."""
-        state = np.zeros((len(SCALES), len(AGILE), 2, 2))
+        """Return what is known where a vehicle was put, at a position (d,) of a stated variance, and moves anyhow."""
+        state = np.zeros((len(SCALES), len(AGILE), 2, len(place_m)))
         state[:, :, 0] = place_m
-        covariance = np.zeros_like(state)
+        covariance = np.zeros((len(SCALES), len(AGILE), 2, 2))
         covariance[:, :, 0, 0] = variance_m2 * SCALES[:, None] ** 2
         covariance[:, :, 1, 1] = speed_sd_mps**2
         return replace(self, time_s=time_s, state=state, covariance=covariance)
 
     def taken(self, time_s: float, place_m: Floats, variance_m2: float) -> tuple[Scatter, float]:
-        """Return what is known once a position (2,) of a stated variance came, by the members.
+        """Return what is known once a position (d,) of a stated variance came, by the members.
 
         Beside it the logarithm of how likely that was, over that of one that may be anything.
         """
@@ -100,15 +100,16 @@ class Scatter:
         noise = variance_m2 * SCALES[:, None] ** 2
         spread = covariance[..., 0, 0] + noise
         miss = place_m - state[:, :, 0]
-        sized = np.log(1.0 - STRAY) - np.log(2.0 * np.pi * spread) - 0.5 * (miss**2).sum(axis=-1) / spread
-        believed = sized > stray(2)
+        axes = len(place_m)
+        sized = np.log(1.0 - STRAY) - 0.5 * (axes * np.log(2.0 * np.pi * spread) + (miss**2).sum(axis=-1) / spread)
+        believed = sized > stray(axes)
         gain = np.where(believed[..., None], covariance[..., 0] / spread[..., None], 0.0)
         keep = np.eye(2) - gain[..., None] * np.array([1.0, 0.0])
         noisy = noise[..., None, None] * gain[..., None] * gain[..., None, :]
         covariance = keep @ covariance @ np.swapaxes(keep, -1, -2) + noisy
         state = state + gain[..., None] * miss[..., None, :]
-        told = np.logaddexp(sized, stray(2))
-        likely = float(np.log(np.sum(self._members * np.exp(told - stray(2)))))
+        told = np.logaddexp(sized, stray(axes))
+        likely = float(np.log(np.sum(self._members * np.exp(told - stray(axes)))))
         return Scatter(_told(self.heard, told), time_s, state, covariance, self.led), likely
 
     def judged(self, miss_m: Floats, spread_m2: Floats, stated_m2: Floats) -> tuple[Scatter, float]:
@@ -130,13 +131,13 @@ class Scatter:
         return replace(self, led=_told(led, told[:, None])), likely
 
     def mixed(self) -> tuple[Floats, Floats]:
-        """Return the mean (2, 2) of all members, place and velocity, and its covariance (4, 4) with their scatter."""
+        """Return the mean (2, d) of all members, place and velocity, and its covariance with their scatter."""
         assert self.state is not None
         assert self.covariance is not None
         weight = self._members
         mean = np.einsum("sq,sqia->ia", weight, self.state)
-        apart = (self.state - mean).reshape(*weight.shape, 4)
-        within = np.kron(np.einsum("sq,sqij->ij", weight, self.covariance), np.eye(2))
+        apart = (self.state - mean).reshape(*weight.shape, mean.size)
+        within = np.kron(np.einsum("sq,sqij->ij", weight, self.covariance), np.eye(mean.shape[1]))
         return mean, within + np.einsum("sq,sqi,sqj->ij", weight, apart, apart)
 
 
