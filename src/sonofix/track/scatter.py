@@ -25,6 +25,8 @@ AGILE: Floats = np.array([5.0, 0.5, 0.05, 0.005, 0.0005])
 PRIOR = 4.0
 """Before anything was heard a scale s is as likely as this power of 1/s: twice the stated is one to sixteen."""
 
+_BEFORE: Floats = -PRIOR * np.log(SCALES)[:, None]
+
 REMEMBERED = 50.0
 """Positions by which the scale is judged: it is then known to 7 %."""
 
@@ -126,7 +128,7 @@ class Scatter:
         told = np.logaddexp(sized, stray(len(miss_m)))
         weight = self.weight
         # what the members learnt before sensors led goes on
-        led = np.maximum(np.log(weight) + PRIOR * np.log(SCALES), -UNDONE)[:, None] if self.led is None else self.led
+        led = _told(np.log(weight)[:, None] - _BEFORE, np.zeros((len(SCALES), 1))) if self.led is None else self.led
         likely = float(np.log(weight @ np.exp(told - stray(len(miss_m)))))
         return replace(self, led=_told(led, told[:, None])), likely
 
@@ -143,14 +145,15 @@ class Scatter:
 
 def _weighed(heard: Floats) -> Floats:
     """Return how likely each is that found what came as likely as ``heard``."""
-    log = heard - PRIOR * np.log(SCALES)[:, None]
+    log = heard + _BEFORE
     weight = np.exp(log - log.max())
     return weight / weight.sum()
 
 
 def _told(heard: Floats, told: Floats) -> Floats:
-    heard = (1.0 - 1.0 / REMEMBERED) * heard + told
-    return np.maximum(heard - heard.max(), -UNDONE)
+    log = (1.0 - 1.0 / REMEMBERED) * heard + told + _BEFORE
+    # not by what was heard alone: scales that few positions refute would come back by what was likely before
+    return np.maximum(log - log.max(), -UNDONE) - _BEFORE
 
 
 def stray(axes: int) -> float:
