@@ -28,7 +28,10 @@ def drive(rng: np.random.Generator) -> Floats:
     return np.array(out)
 
 
-@pytest.mark.parametrize(("stated_m", "sd_m"), [(None, 0.1), (None, 0.3), (None, 1.0), (0.1, 1.0), (0.01, 1.0), (1.0, 1.0)])
+CASES = ((None, 0.1), (None, 0.3), (None, 1.0), (0.1, 1.0), (0.01, 1.0), (1.0, 1.0))
+
+
+@pytest.mark.parametrize(("stated_m", "sd_m"), CASES)
 def test_nees_lies_in_its_band(stated_m: float | None, sd_m: float, rng: np.random.Generator) -> None:
     squared: list[float] = []
     worse: list[float] = []
