@@ -113,3 +113,10 @@ def test_a_folder_of_positions_runs_and_tells_what_it_lacks(tmp_path: Path, rng:
     assert [len(step.estimates) for step in steps] == [1] * 9
     with pytest.raises(ValueError, match=r"positions\.csv is smoothed without"):
         list(smoothed(read_recording(tmp_path), steps, graph=True))
+
+
+def test_two_positions_of_one_vehicle_at_one_time_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "site.toml").write_text('format = 1\n[site]\nname = "yard"\n[[vehicle]]\nid = "agv"\nz_m = 0.0\n')
+    (tmp_path / "positions.csv").write_text("time_s,x_m,y_m\n0.0,1.0,2.0\n1.0,1.0,2.0\n1.0,3.0,2.0\n")
+    with pytest.raises(RecordingError, match=r"positions\.csv: row 3, time_s = 1\.0: row 2 tells of 'agv' at the same"):
+        read_recording(tmp_path, to_run=True)

@@ -201,7 +201,7 @@ def _exchange_problems(table: Table, site: Site) -> list[Problem]:
 
 
 def _position_problems(table: Table | None, site: Site) -> list[Problem]:
-    """Tell positions of nobody, and those without the height that nothing else states."""
+    """Tell positions of nobody, two of one vehicle at one time, and those without the height that nothing states."""
     if table is None or not len(table.columns["time_s"]):
         return []
     if not site.vehicles:
@@ -211,7 +211,13 @@ def _position_problems(table: Table | None, site: Site) -> list[Problem]:
     open_ones = {v.id for v in site.vehicles if v.z_m is None}
     bare = sorted({name for name, z in zip(whose, height_m, strict=True) if name in open_ones and np.isnan(z)})
     remedy = "has rows without z_m; give it, or state the level z_m of the [[vehicle]] in site.toml"
-    return [Problem("positions.csv", "vehicle", name, remedy) for name in bare]
+    problems = [Problem("positions.csv", "vehicle", name, remedy) for name in bare]
+    first: dict[tuple[str, float], int] = {}
+    for row, at in enumerate(zip(whose, table.columns["time_s"].tolist(), strict=True), 1):
+        if first.setdefault(at, row) != row:
+            remedy = f"row {first[at]} tells of {at[0]!r} at the same time; keep one of them, or give each its own time"
+            return [*problems, Problem("positions.csv", f"row {row}, time_s", at[1], remedy)]
+    return problems
 
 
 def _with_period(site: Site, sync: Table | None) -> Site:
