@@ -45,6 +45,8 @@ class Moment:
         That were found out now, or that robots were lost by.
     odds : tuple of Odds
         Robots that contradict each other now.
+    innovation : Innovation or None
+        Of what was taken in now; None where nothing was.
     gainsaid : tuple of int
         Robots whose stated starts were found wrong now.
     unheard : tuple of int

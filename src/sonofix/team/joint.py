@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sonofix.records import Event, Floats, Innovation
 from sonofix.team.belief import START_SD, Belief, Moment
 from sonofix.team.feed import SIGHTING, Feed
+from sonofix.team.fits import Fits
 from sonofix.team.hear import TOLD
 from sonofix.team.instants import leave
 from sonofix.team.placing import Placed, place
@@ -43,6 +44,7 @@ class Team:
         for robot, start in feed.starts.items():
             self.belief.put(robot, Placed(np.array(start), np.diag(np.square(START_SD)), {}))
         self.watch, self._recent, self._rough = Watch(len(feed.robots)), Recent(feed), Rough(feed)
+        self.fits = Fits(feed)
         self._until_placed = until_placed
         self._past: deque[Before] = deque()
         self._begin_s = self._now_s = np.nan
@@ -54,10 +56,11 @@ class Team:
         self.feed = feed
         self._recent.believe(feed)
 
-    def step(self, time_s: float, rows: tuple[int, int], unproven: bool = False) -> Moment:
+    def step(self, time_s: float, rows: tuple[int, int], unproven: Collection[int] = ()) -> Moment:
         """Carry all on to an instant, and take in what was heard then.
 
-        ``unproven``: nobody is sought who is not where its track has it, and nothing learnt of noise from how it fits.
+        ``unproven``: robots that are not sought where they are not where their tracks have them; while there are any,
+        nothing is learnt of noise from how what is heard fits.
         """
         feed, belief = self.feed, self.belief
         events: list[Event] = []
@@ -72,6 +75,7 @@ class Team:
             for robot in leave(feed, belief.placed, self._recent, time_s, since_s, events):
                 belief.lift(robot)
                 self.watch.clear(robot)
+                self.fits.clear(robot)
         frozen = self._until_placed and belief.placed.all()
         count = rows[1] - rows[0]
         used, told = np.zeros((count, 2), bool), np.full((count, 2, TOLD), np.nan)
@@ -87,8 +91,9 @@ class Team:
             for robot in ends:
                 self._rough.slipped(belief, robot, time_s)
             self.watch.see(feed, rows, used, told)
-            if not unproven and (feed.kind[slice(*rows)] == SIGHTING).any():
-                self._seek(events, pushes)
+            self.fits.see(feed, time_s, rows, used, told)
+            if (feed.kind[slice(*rows)] == SIGHTING).any():
+                self._seek(unproven, events, pushes)
             if not unproven:
                 belief.learn(feed, rows, used, told)
         if not frozen:
@@ -98,7 +103,7 @@ class Team:
                 self._place(events)
         if any(event.event in ("joined", "left", "lost") for event in events):
             self._past.clear()  # it was before that
-        odds = self.watch.at_odds() if not unproven else ()
+        odds = tuple(one for one in self.watch.at_odds() if not set(one.robots) & set(unproven))
         events += [event for one in odds if one.robots not in self._told_of for event in _odd(feed, one, time_s)]
         self._told_of = {one.robots for one in odds}
         moment = belief.moment(time_s, rows, used, events, pushes)
@@ -120,11 +125,13 @@ class Team:
                 belief.put(robot, found)
                 events.append(Event(self._now_s, self.feed.robots[robot], "joined", placed_text(found.pose)))
 
-    def _seek(self, events: list[Event], pushes: list[Push]) -> None:
-        """Find robots that are not where their tracks have them, or take away their places."""
+    def _seek(self, unproven: Collection[int], events: list[Event], pushes: list[Push]) -> None:
+        """Find robots that are not where their tracks have them, or take away their places; none of ``unproven``."""
         for _ in self.feed.robots:
             astray = self.watch.astray()
             for robot, first in astray:
+                if robot in unproven:
+                    continue
                 others = [other for other, _ in astray if other != robot]
                 if self._reopen(robot, first, others, events, pushes):
                     break
@@ -167,6 +174,7 @@ class Team:
         for one in (robot, *others):
             self._rough.unlearn(belief, one, was.learnt, was.rough)
         self.watch.clear(robot)
+        self.fits.clear(robot)
         return True
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from sonofix.records import Event, Floats
 from sonofix.team.belief import START_SD, Belief, Moment
 from sonofix.team.feed import SIGHTING, Feed
-from sonofix.team.joint import Team
+from sonofix.team.joint import Team, placed_text
 from sonofix.team.kernel import STRAYS, drive, strayed, turned_by
 from sonofix.team.placing import Placed
 from sonofix.team.recent import lasting
@@ -52,7 +52,7 @@ class Proof:
         self._heard_s, self._settled_s = np.full(len(feed.robots), np.nan), np.full(len(feed.robots), np.nan)
         self._joined: dict[int, tuple[float, Floats, Floats]] = {}
         self._begin_s = self._now_s = np.nan
-        self._misfits = False
+        self._doubted: set[int] = set()
 
     @property
     def unmoved(self) -> Belief:
@@ -66,26 +66,42 @@ class Proof:
     def step(self, team: Team, time_s: float, rows: tuple[int, int]) -> tuple[Moment, Team]:
         """Carry a team on to an instant, and judge where it started; return the team that goes on."""
         first = team is not self._other
-        moment = team.step(time_s, rows, unproven=first)
+        unproven = self.starts - team.fits.stood if first else set[int]()
+        moment = team.step(time_s, rows, unproven)
         if np.isnan(self._now_s):
             self._begin_s = self._now_s = time_s
         self._reckoned.drive(self._feed, self._now_s, time_s)
         self._now_s = time_s
         if first:
             self._other.step(time_s, rows)
-            # it may come to fit, wrong as it is, and one that starts wrong drags others along
-            self._misfits |= any(team.watch.disagrees(robot) for robot in range(len(self._heard_s)))
-            for robot in self.starts if self._misfits else ():
+            # where it started no longer matters of one that left, nor of one that was pushed or lost after it had stood
+            self.starts -= {push.robot for push in moment.pushes} | set(np.flatnonzero(~team.belief.placed).tolist())
+            self._doubted |= team.fits.doubted
+            # they may come to fit, wrong as they are, and one that starts wrong drags others along
+            for robot in self.starts if team.fits.open else ():
                 moment.covariance[robot] += np.diag(np.square(OPEN_SD))
         self._note(rows)
-        wrong, events = self._judge(stands=first)
+        wrong, events = self._judge(team)
         if wrong and first:
+            events += self._instead(team)
             team = self._other
             told = team.belief.moment(time_s, rows, moment.used, (*moment.events, *events))
             return replace(told, gainsaid=wrong, anew=True), team
-        if first and not self.starts:
+        if first and unproven and not self.starts:
             team.belief.noise.take_over(self._other.belief.noise)
         return replace(moment, events=(*moment.events, *events), gainsaid=wrong), team
+
+    def _instead(self, team: Team) -> list[Event]:
+        """Tell of robots that have a place in only one of a team and the other, which goes on instead."""
+        had, has, names = team.belief.placed, self._other.belief.placed, self._feed.robots
+        why = "its place rested on starts that are gainsaid: to be placed anew"
+        lost = [Event(self._now_s, names[r], "lost", why) for r in np.flatnonzero(had & ~has).tolist()]
+        mean = self._other.belief.mean
+        joined = [
+            Event(self._now_s, names[r], "joined", placed_text(mean[self._other.belief.at(r)]))
+            for r in np.flatnonzero(has & ~had).tolist()
+        ]
+        return lost + joined
 
     def _note(self, rows: tuple[int, int]) -> None:
         """Note who was heard, and who is where the other filter has it."""
@@ -103,36 +119,55 @@ class Proof:
                 there = self._other.belief.mean[at].copy(), self._other.belief.covariance[at, at].copy()
                 self._joined[robot] = self._now_s, *there
 
-    def _judge(self, stands: bool) -> tuple[tuple[int, ...], list[Event]]:
+    def _judge(self, team: Team) -> tuple[tuple[int, ...], list[Event]]:
         """Compare starts with where the other filter has robots; return those gainsaid.
 
-        ``stands``: the team goes by them; else one that is taken as stated is put where it leads to.
+        Where the other is the team already, one that is taken as stated is put where it leads to.
         """
         wrong: list[int] = []
         events: list[Event] = []
-        other, reckoned = self._other.belief, self._reckoned
+        other, reckoned, stands = self._other.belief, self._reckoned, team is not self._other
         for robot in sorted(self.starts):
             at = other.at(robot)
             if not self._now_s - self._settled_s[robot] >= SETTLED_S:
                 heard_s = self._heard_s[robot]
-                if self._now_s - (heard_s if np.isfinite(heard_s) else self._begin_s) > STANDS_S:
+                since_s = heard_s if np.isfinite(heard_s) else self._begin_s
+                # while the team goes by starts, one that is wrong may draw others to where they are not
+                if self._now_s - since_s > STANDS_S and not (stands and self._doubted & self.starts):
                     self.starts.discard(robot)
-                    if not stands and not other.placed[robot]:
+                    if not stands and not other.placed[robot] and robot not in self._doubted:
                         other.put(robot, Placed(reckoned.mean[at].copy(), reckoned.covariance[at, at].copy(), {}))
+                        told = placed_text(other.mean[at])
+                        events.append(Event(self._now_s, self._feed.robots[robot], "joined", told))
                 continue
             self.starts.discard(robot)
             off = reckoned.mean[at] - other.mean[at]
             off[YAW] = turned_by(off[YAW])
             now = self._now_s, other.mean[at], other.covariance[at, at]
             # as it joined less was driven; now more is known of where it is
-            if max(unlikely(self._feed, robot, self._begin_s, *then) for then in (self._joined[robot], now)) > GAINSAID:
+            far = max(unlikely(self._feed, robot, self._begin_s, *then) for then in (self._joined[robot], now))
+            if far > GAINSAID and stands and not team.fits.misfits and not self._meet(team, robot):
+                # all fits as it is, and the other may have joined at a mirror image
+                if self._now_s - self._heard_s[robot] <= STANDS_S:
+                    self.starts.add(robot)
+                continue
+            if far > GAINSAID:
                 wrong.append(robot)
                 text = (
                     f"what is heard gainsays how it was stated to start, by {np.hypot(*off[:2]):.2f} m and "
-                    f"{abs(np.degrees(off[YAW])):.0f}° by now: placed by what is heard; is start.csv right?"
+                    f"{abs(np.degrees(off[YAW])):.0f}° by now: placed by what is heard; "
+                    "is start.csv right, or was it pushed soon after?"
                 )
                 events.append(Event(self._now_s, self._feed.robots[robot], "reset", text))
         return tuple(wrong), events
+
+    def _meet(self, team: Team, robot: int) -> bool:
+        """Whether a team has a robot by now where the other filter has it: then it is the start that is off."""
+        at = team.belief.at(robot)
+        off = team.belief.mean[at] - self._other.belief.mean[at]
+        off[YAW] = turned_by(off[YAW])
+        known = self._other.belief.covariance[at, at] + team.belief.covariance[at, at]
+        return float(off @ np.linalg.solve(known, off)) < GAINSAID
 
 
 def unlikely(feed: Feed, robot: int, begin_s: float, now_s: float, pose: Floats, covariance: Floats) -> float:
