@@ -57,23 +57,20 @@ class Landmarks:
         if time_s - self._asked_s < (ASK_S if time_s - self._first_s < GATHER_S else LATER_S):
             return set(), []
         self._asked_s = time_s
-        wrong = self._wrong(belief, time_s)
-        if wrong is None:
+        name = self._wrong(belief, time_s)
+        if name is None:
             return set(), []
-        name, miss_m = wrong
         pairs = {pair for pair, its in self._name.items() if its == name}
         self._feed = self._feed.without((), pairs)
         self._recent.believe(self._feed)
-        off = "" if miss_m is None else f", its ranges by {miss_m:+.2f} m (median)"
-        text = f"it misses what all else tells{off}, and is left out: are its position_m, delay_s and code right?"
+        text = "it misses what all else tells, and is left out: are its position_m, delay_s and code right?"
         return pairs, [Event(time_s, "", "excluded", f"{name}: {text}")]
 
-    def _wrong(self, belief: Belief, time_s: float) -> tuple[str, float | None] | None:
-        """Return the fixed end that does not go with the rest, and by how much its ranges miss."""
+    def _wrong(self, belief: Belief, time_s: float) -> str | None:
+        """Return the fixed end that does not go with the rest."""
         whole = 0.0
         costs: dict[str, float] = {}  # by how much leaving it out mends
         counts: dict[str, int] = {}
-        misses: dict[str, list[float]] = {}
         count = 0
         for robot in np.flatnonzero(belief.placed).tolist():
             clues = self._recent.clues(robot, time_s, self._nobody, belief)
@@ -84,18 +81,16 @@ class Landmarks:
             names = np.array([self._name[pair] for pair in clues.pair.tolist()])
             frame = settle(clues, np.zeros(3))
             all_cost, number = _cost(clues, frame)
-            apart: dict[str, tuple[float, int, np.ndarray]] = {}
+            apart: dict[str, tuple[float, int]] = {}
             for name in np.unique(names).tolist():
                 left = clues.keep(names != name)
                 without = settle(left, frame)
-                apart[name] = (*_cost(left, without), without)
+                apart[name] = _cost(left, without)
                 all_cost = min(all_cost, _cost(clues, without)[0])
             whole, count = whole + all_cost, count + number
-            for name, (cost, rest, without) in apart.items():
-                out = names == name
+            for name, (cost, rest) in apart.items():
                 costs[name] = costs.get(name, 0.0) + all_cost - cost
                 counts[name] = counts.get(name, 0) + number - rest
-                misses.setdefault(name, []).extend(_off_m(clues.keep(out), without))
         if len(costs) < 2:
             return None
         by_gain = sorted(costs, key=lambda name: costs[name], reverse=True)
@@ -105,25 +100,10 @@ class Landmarks:
             return None
         if costs[worst] / own < max(MISSES, MENDS * kept / rest):
             return None
-        return worst, float(np.median(misses[worst])) if misses[worst] else None
+        return worst
 
 
 def _cost(clues: Clues, frame: np.ndarray) -> tuple[float, int]:
     """Return the sum of squares, none of which counts more than an outlier's, and how many they are."""
     missed = residuals(clues, frame).residual
     return float(np.sum(np.minimum(missed**2, LIMIT**2))), len(missed)
-
-
-def _off_m(clues: Clues, frame: np.ndarray) -> list[float]:
-    """Return by how much ranges are longer than a frame has them."""
-    turned = frame[2] + clues.own[:, 2]
-    turn = np.array([[np.cos(frame[2]), -np.sin(frame[2])], [np.sin(frame[2]), np.cos(frame[2])]])
-    arm = np.column_stack(
-        [
-            np.cos(turned) * clues.arm[:, 0] - np.sin(turned) * clues.arm[:, 1],
-            np.sin(turned) * clues.arm[:, 0] + np.cos(turned) * clues.arm[:, 1],
-        ]
-    )
-    apart = clues.other[:, :2] - frame[:2] - clues.own[:, :2] @ turn.T - arm
-    off = clues.range_m - np.sqrt(np.sum(apart**2, axis=1) + clues.arm[:, 2] ** 2)
-    return off[np.isfinite(off)].tolist()
