@@ -91,6 +91,9 @@ def test_what_cannot_be_is_told() -> None:
     found = plan(formation(), COURSE, near, 0.1, **CHOICE)
     assert (found.status, found.robot) == ("unreachable", "")
     assert "beyond 5 m of each other" in found.remedy
+    far = plan(formation(), Course(COURSE.start_m, COURSE.heading_rad, 12e3), RANGING, 5.0, **CHOICE)
+    assert far.status == "unreachable"
+    assert "1000 leaps" in far.remedy
     for wrong in (0.0, np.nan):
         with pytest.raises(ValueError, match="above 0"):
             plan(formation(), COURSE, RANGING, wrong)

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from sonofix.records import Floats
-from sonofix.team.ahead import Course, Ranging, ahead
+from sonofix.team.ahead import MOST_LEAPS, Course, Ranging, ahead
 from sonofix.team.leapfrog import Formation
 
 STEPS_M = (5.0, 7.5, 10.0, 12.5, 15.0, 20.0, 25.0, 30.0)
@@ -29,7 +29,8 @@ class Plan:
 
     Attributes
     ----------
-    status : "ok", "beyond" (no plan ends as well as wanted: this one ends best), "unreachable" (none keeps in reach)
+    status : "ok", "beyond" (no plan ends as well as wanted: this one ends best), "unreachable" (none keeps in reach, or
+        gets there in `MOST_LEAPS`)
     remedy : str
         Empty where ok; where beyond, it tells the best end error that can be reached.
     robot : str
@@ -94,6 +95,8 @@ def plan(
     kept = np.flatnonzero(np.isfinite(end_sd))
     if not len(kept):
         text = f"every strip takes robots beyond {ranging.reach_m:g} m of each other: bring them nearer together"
+        if tries.leaps.max() >= MOST_LEAPS:
+            text = f"a course of {course.length_m:g} m takes more than {MOST_LEAPS} leaps: plan it in parts"
         return Plan("unreachable", text, "", np.full(2, np.nan), np.nan, np.nan, 0, np.nan)
     enough = kept[end_sd[kept] <= wanted_sd_m]
     if len(enough):
