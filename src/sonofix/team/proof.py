@@ -3,7 +3,7 @@
 Beside the team's filter runs another that knows no start pose: robots join it by what is heard and by their odometry.
 A start, carried on by odometry, is a claim of where a robot is now; once the other filter has it settled, both are
 compared. What agrees is proven. What does not is gainsaid, and the other filter, which no wrong start ever touched, is
-the team's from then on. Until then nothing is learnt from how measurements fit.
+the team's from then on. Until a start was borne out by what is heard (`fits`) no push of its robot is sought.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TURNS = 10
 """Linearisations at most: of ways whose turns are known to a tenth, ends lie on a bow."""
 
 STANDS_S = 30.0
-"""A start that nothing heard has decided on for so long is taken as stated: clues are gathered no longer."""
+"""A start that nothing heard has decided on for so long is taken as stated, unless some disagreed with what is heard."""
 
 OPEN_SD = (3.0, 3.0, 1.5)
 """By how much, in m and rad, poses are open that start as stated, once what was heard disagreed."""
