@@ -31,7 +31,7 @@ TURNS = 10
 """Linearisations at most: of ways whose turns are known to a tenth, ends lie on a bow."""
 
 STANDS_S = 30.0
-"""A start that nothing heard has decided on for so long is taken as stated, unless some disagreed with what is heard."""
+"""A start that nothing heard has decided on for so long is taken as stated, where none disagreed with others."""
 
 OPEN_SD = (3.0, 3.0, 1.5)
 """By how much, in m and rad, poses are open that start as stated, once what was heard disagreed."""
