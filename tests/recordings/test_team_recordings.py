@@ -13,6 +13,7 @@ from sonofix.team.feed import gather
 from sonofix.team.fleet import follow
 from sonofix.team.smooth import smooth
 from sonofix.team.tell import ranges_of
+from team.made_fleet import watched
 
 
 def test_five_real_robots_find_themselves_and_each_other(data):
@@ -36,10 +37,7 @@ def test_a_pushed_robot_is_found_from_waveforms_and_nobody_else_blamed(captures)
     folder = captures / "team"
     heard = ranges_of(step.ranges for step in flow.run(read_recording(folder, to_run=True)))
     feed = gather(read_recording(folder, to_run=True), heard, own_ranges=True)
-    moments, means, belief = [], [], None
-    for moment, belief in follow(feed):
-        moments.append(moment)
-        means.append(belief.mean.copy())
+    moments, means, belief = watched(feed)
     for name, truth in read_truth(folder).items():
         r = feed.robots.index(name)
         outside = [m for m in moments if not 9.0 <= m.time_s <= 10.0]
@@ -59,8 +57,7 @@ def test_a_pushed_robot_is_found_from_waveforms_and_nobody_else_blamed(captures)
             assert np.hypot(*off) < 0.015
 
     # smoothed, it is as open while it is pushed as nobody knows then where it is
-    assert belief is not None
-    after = smooth(feed, moments, belief, np.array(means))
+    after = smooth(feed, moments, belief, means)
     r, truth = feed.robots.index("R1"), read_truth(folder)["R1"]
     for m in after:
         off = m.pose[r, :2] - [np.interp(m.time_s, truth.time_s, truth.position_m[:, i]) for i in range(2)]

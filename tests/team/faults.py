@@ -6,7 +6,7 @@ import numpy as np
 
 from sonofix.records import Recording, Table
 from sonofix.team.feed import gather
-from sonofix.team.fleet import follow
+from team.made_fleet import watched
 
 
 def with_start(recording: Recording, truth: dict[str, np.ndarray], off: dict[int, tuple[float, float, float]]):
@@ -42,12 +42,7 @@ def with_longer(recording: Recording, landmark: str, by_m: float):
 def followed(recording: Recording):
     """Return the moments of a recording, the filter's means, its last belief and its feed."""
     feed = gather(recording)
-    moments, means, belief = [], [], None
-    for moment, belief in follow(feed):
-        moments.append(moment)
-        means.append(belief.mean.copy())
-    assert belief is not None
-    return moments, np.array(means), belief, feed
+    return *watched(feed), feed
 
 
 def told(moments) -> list[tuple[str, str]]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from sonofix.records import RangeRows, Recording, Table
 from sonofix.site import Site
+from sonofix.team.fleet import follow
 from sonofix.team.state import SLIP_S, SLIP_SD
 from sonofix.track.wheels import SLIP_M, TWIST_M, TWIST_RAD
 
@@ -112,6 +113,16 @@ def fleet(
 def without_bearings(recording: Recording) -> Recording:
     """Return the recording with ranges alone."""
     return replace(recording, tables={name: t for name, t in recording.tables.items() if name != "bearings"})
+
+
+def watched(feed):
+    """Return the moments of a feed, the filter's means (moments, n) and what it believes at last."""
+    moments, means, belief = [], [], None
+    for moment, belief in follow(feed):
+        moments.append(moment)
+        means.append(belief.mean.copy())
+    assert belief is not None
+    return moments, np.array(means), belief
 
 
 def errors(moments, truth: dict[str, np.ndarray], after_s: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from sonofix.team.noise import NEW, STAYING, variance_of
 from sonofix.team.smooth import smooth
 from sonofix.team.state import SCALE, SIZE
 from sonofix.team.tell import listened, ranges_of, steps_of
-from team.made_fleet import errors, fleet, nees
+from team.made_fleet import errors, fleet, nees, watched
 
 
 def run(recording, **options):
@@ -56,11 +56,8 @@ def test_one_that_hears_landmarks_carries_the_others():
 def test_smoothing_is_better_and_reaches_back():
     recording, truth = fleet(seconds=40, seed=2)
     feed = gather(recording)
-    moments, means = [], []
-    for moment, belief in follow(feed):
-        moments.append(moment)
-        means.append(belief.mean.copy())
-    after = smooth(feed, moments, belief, np.array(means))
+    moments, means, belief = watched(feed)
+    after = smooth(feed, moments, belief, means)
     causal, smoothed = (errors(m, truth)[0] for m in (moments, after))
     assert np.mean(smoothed**2) < 0.9 * np.mean(causal**2)
     assert after[0].placed.all()
@@ -95,17 +92,13 @@ def test_one_push_is_one_event_of_the_robot_pushed_and_nobody_is_dragged_along(r
 def test_smoothed_a_robot_is_free_while_it_is_pushed(robot, at_s, by_m, takes_s):
     recording, truth = fleet(seconds=at_s + 8, seed=40 + robot, pushed=((robot, at_s, *by_m),), push_takes_s=takes_s)
     feed = gather(recording)
-    moments, means, belief = [], [], None
-    for moment, belief in follow(feed):
-        moments.append(moment)
-        means.append(belief.mean.copy())
-    assert belief is not None
+    moments, means, belief = watched(feed)
     pushes = [push for moment in moments for push in moment.pushes]
     assert [push.robot for push in pushes] == [robot]
     # truth's rows are 0.1 s apart, and what is heard 0.4 s
     assert at_s - 0.8 <= pushes[0].after_s <= at_s
     assert at_s + takes_s - 0.11 <= pushes[0].until_s <= at_s + takes_s + 0.8
-    after = smooth(feed, moments, belief, np.array(means))
+    after = smooth(feed, moments, belief, means)
     around = [m for m in after if at_s - 1.0 < m.time_s < at_s + takes_s + 2.0]
     error, covariance = errors(around, truth)
     # 2 where deviations are right, of some 25 errors alike over seconds
@@ -179,16 +172,12 @@ def test_two_that_contradict_each_other_alone_are_both_doubted(turn_rad):
     # as far from the first as it is, so that only its ranges with the second are wrong
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     feed = standing(starts, [*starts[:2], (cos - 3 * sin, sin + 3 * cos, 0.0)])
-    moments, means, belief = [], [], None
-    for moment, belief in follow(feed):
-        moments.append(moment)
-        means.append(belief.mean.copy())
-    assert belief is not None
+    moments, means, belief = watched(feed)
     events = [(e.event, e.vehicle) for m in moments for e in m.events]
     assert events == [("excluded", "R1"), ("excluded", "R2")]
     assert all("while all else agrees" in e.detail for m in moments for e in m.events)
     for r in range(3):
-        for moment in (moments[-1], *smooth(feed, moments, belief, np.array(means))):
+        for moment in (moments[-1], *smooth(feed, moments, belief, means)):
             off = moment.pose[r, :2] - starts[r][:2]
             assert off @ np.linalg.solve(moment.covariance[r, :2, :2], off) < 9.0
     moments = [m for m, _ in follow(standing(starts, starts))]
@@ -237,12 +226,8 @@ def test_a_tone_is_told_where_it_begins_changes_and_ends():
 def test_smoothing_keeps_what_start_poses_tell():
     starts = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (1.0, 3.0, 0.0)]
     feed = standing(starts, starts)
-    moments, means, belief = [], [], None
-    for moment, belief in follow(feed):
-        moments.append(moment)
-        means.append(belief.mean.copy())
-    assert belief is not None
-    for moment in smooth(feed, moments, belief, np.array(means)):
+    moments, means, belief = watched(feed)
+    for moment in smooth(feed, moments, belief, means):
         for r in range(3):
             # no surer than three such starts make it, and hardly less than one does
             assert 0.02 < np.sqrt(moment.covariance[r, 0, 0]) < 0.06
@@ -469,17 +454,13 @@ def test_a_sound_speed_that_is_off_is_one_error_of_all_ranges_and_is_found_out(f
         recording = in_sound(recording, truth, off, fixed)
         feed = gather(recording, recording.ranges, own_ranges=True)
         assert feed.scale_sd == pytest.approx(SHARE_SD)
-        moments, means, belief = [], [], None
-        for moment, belief in follow(feed):
-            moments.append(moment)
-            means.append(belief.mean.copy())
-        assert belief is not None
+        moments, means, belief = watched(feed)
         scale = belief.mean[SCALE : SIZE * 3 : SIZE]
         # one number; a range of 1 mm over 3 m tells it to 3e-4, and there are hundreds
         np.testing.assert_allclose(scale, scale[0], rtol=1e-6)
         assert abs(scale[0] - off) < 4 * np.sqrt(belief.covariance[SCALE, SCALE]) < SHARE_SD / 6
         ratios.append(nees(*errors(moments, truth, after_s=5)))
-        ratios.append(nees(*errors(smooth(feed, moments, belief, np.array(means)), truth, after_s=5)))
+        ratios.append(nees(*errors(smooth(feed, moments, belief, means), truth, after_s=5)))
         apart.append(nees(*errors([moment for moment, _ in follow_apart(feed)], truth, after_s=5)))
         taken = [m for m, _ in follow(replace(feed, scale_sd=0.0))]
         spared.append(nees(*errors(taken, truth, after_s=5)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from sonofix.records import Event
 from sonofix.team.belief import Belief
-from sonofix.team.feed import COMPASS, SIGHTING, Feed
+from sonofix.team.feed import COMPASS, Feed
 from sonofix.team.kernel import turned_by
 from sonofix.team.state import SIZE, YAW
 from sonofix.track.wheels import COMPASS_SD_RAD
@@ -42,8 +42,7 @@ class Compasses:
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
         told = np.flatnonzero((feed.kind == COMPASS) & np.isfinite(feed.bearing_rad))
-        fixed = (feed.kind == SIGHTING) & ((feed.listener < 0) | (feed.source < 0))
-        self._open = {int(feed.listener[i]): int(feed.pair[i]) for i in told} if fixed.any() else {}
+        self._open = {int(feed.listener[i]): int(feed.pair[i]) for i in told} if feed.of_fixed.any() else {}
         self._first_s: dict[int, float] = {}
         self._kept: dict[int, deque[tuple[float, float, bool]]] = {r: deque(maxlen=READINGS) for r in self._open}
         self.unheard = set(self._open.values())

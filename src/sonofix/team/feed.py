@@ -86,6 +86,11 @@ class Feed:
         return int(self.view.max()) + 1 if len(self.view) else 0
 
     @property
+    def of_fixed(self) -> NDArray[np.bool_]:
+        """Which rows are sightings with a fixed end."""
+        return (self.kind == SIGHTING) & ((self.listener < 0) | (self.source < 0))
+
+    @property
     def stated_sd_m(self) -> float:
         """The median deviation that ranges state; NaN where one of them states none."""
         sd_m = self.range_sd_m[np.isfinite(self.range_m)]

@@ -91,7 +91,8 @@ class Team:
             for robot in ends:
                 self._rough.slipped(belief, robot, time_s)
             self.watch.see(feed, rows, used, told)
-            self.fits.see(feed, time_s, rows, used, told)
+            if feed.starts:  # of nothing else is it asked
+                self.fits.see(feed, time_s, rows, used, told)
             if (feed.kind[slice(*rows)] == SIGHTING).any():
                 self._seek(unproven, events, pushes)
             if not unproven:

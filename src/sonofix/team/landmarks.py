@@ -13,7 +13,7 @@ import numpy as np
 
 from sonofix.records import Event
 from sonofix.team.belief import Belief
-from sonofix.team.feed import SIGHTING, Feed
+from sonofix.team.feed import Feed
 from sonofix.team.placing import LIMIT, Clues, doubt_of, residuals, settle
 from sonofix.team.recent import GATHER_S, Recent
 
@@ -42,7 +42,7 @@ class Landmarks:
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
         self._recent = Recent(feed)
-        fixed = np.flatnonzero((feed.kind == SIGHTING) & ((feed.listener < 0) | (feed.source < 0)))
+        fixed = np.flatnonzero(feed.of_fixed)
         self._name = {int(feed.pair[i]): feed.ends[i][0 if feed.source[i] < 0 else 1] for i in fixed.tolist()}
         self._nobody = np.zeros(len(feed.robots), bool)
         self._first_s = self._asked_s = np.nan

@@ -42,9 +42,8 @@ class Proof:
 
     def __init__(self, feed: Feed) -> None:
         self._feed = feed
-        fixed = (feed.kind == SIGHTING) & ((feed.listener < 0) | (feed.source < 0))
         # where no fixed end is heard nothing could gainsay them
-        self.starts = set(feed.starts) if fixed.any() else set()
+        self.starts = set(feed.starts) if feed.of_fixed.any() else set()
         self._other = Team(feed.without(self.starts, ()))
         self._reckoned = Belief.blank(feed)
         for robot, start in feed.starts.items():

@@ -36,10 +36,8 @@ class Spreads:
 
     def noise(self, fix: Fix, axes: Sequence[str]) -> Floats:
         """Covariance (d, d) of a fix along axes, as its deviations are to be taken."""
-        assert fix.covariance is not None
-        rows = [fix.states.index(axis) for axis in axes]
         each = np.array([self.height.scale if axis == "z" else self.level.scale for axis in axes])
-        return fix.covariance[np.ix_(rows, rows)] * np.outer(each, each)
+        return _stated_m2(fix, axes) * np.outer(each, each)
 
     def begun(self, time_s: float, fix: Fix, speed_sd_mps: float) -> Spreads:
         """Return what is known where a fix put a vehicle, which moves anyhow."""
@@ -63,9 +61,7 @@ class Spreads:
 
         ``miss_m`` (d,) is by how much it is off the track, ``spread_m2`` (d, d) the covariance of what that expects.
         """
-        assert fix.covariance is not None
-        rows = [fix.states.index(axis) for axis in axes]
-        stated = fix.covariance[np.ix_(rows, rows)]
+        stated = _stated_m2(fix, axes)
         both, likely = [self.level, self.height], 0.0
         for k, names in enumerate(("xy", "z")):
             own = [i for i, axis in enumerate(axes) if axis in names]
@@ -89,6 +85,13 @@ class Spreads:
 def spreads() -> Spreads:
     """Return what is known before any position came."""
     return Spreads(scatter(), scatter())
+
+
+def _stated_m2(fix: Fix, axes: Sequence[str]) -> Floats:
+    """Covariance (d, d) that a fix states along axes."""
+    assert fix.covariance is not None
+    rows = [fix.states.index(axis) for axis in axes]
+    return fix.covariance[np.ix_(rows, rows)]
 
 
 def _variance_m2(fix: Fix, axes: str) -> float:
